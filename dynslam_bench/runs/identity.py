@@ -29,7 +29,7 @@ from dynslam_bench.core.module_graph import (
     read_module_graph,
 )
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.reads import Anchors, ImportPath
+from dynslam_bench.core.reads import BaseFolders, ImportPath
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
 from dynslam_bench.envs import Degradation
@@ -37,7 +37,7 @@ from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.own_code import (
-    anchors_of,
+    base_folders_of,
     is_file,
     is_foreign,
     module_of,
@@ -77,7 +77,7 @@ class ResolvedRun:
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What is asked for, and what is known beforehand of what the run will read.
-        anchors: The folders in which names of files begin that plug-ins and programs read.
+        base_folders: The folders in which names of files begin that plug-ins and programs read.
         foreign: Whether plug-ins or programs take part: what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
         files: Those that the tracker's command names, in the identity by their content.
@@ -90,7 +90,7 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
-    anchors: Anchors
+    base_folders: BaseFolders
     foreign: bool = False
     start_map: StartMap | None = None
     files: tuple[Path, ...] = ()
@@ -200,8 +200,8 @@ class Resolver:
         entry_points = parts_of_run(
             tracker, settings, source, sequence, changes_frames=changes_frames
         )
-        anchors = anchors_of(tracker, entry_points)
-        parts = sorted(named_part(entry, anchors) for entry in entry_points)
+        base_folders = base_folders_of(tracker, entry_points)
+        parts = sorted(named_part(entry, base_folders) for entry in entry_points)
 
         # what it will read, as far as that is known beforehand
         read = {
@@ -225,7 +225,7 @@ class Resolver:
             device=device,
             segmentation=source,
             identity=asked | read,
-            anchors=anchors,
+            base_folders=base_folders,
             foreign=any(map(is_foreign, parts)) or bool(tracker.files),
             start_map=start_map,
             files=files,

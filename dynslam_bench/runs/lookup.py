@@ -45,7 +45,9 @@ class LookUp:
         ]
         if differing:
             return ", ".join(differing)
-        return "" if newest.reads is None else self._verifier.changed(newest.reads, run.anchors)
+        return (
+            "" if newest.reads is None else self._verifier.changed(newest.reads, run.base_folders)
+        )
 
     def _candidates(self, run: ResolvedRun) -> list[RunRecord]:
         """The stored runs of a request, whatever they have read."""
@@ -62,4 +64,4 @@ class LookUp:
         if not run.foreign:
             return True
         reads = record.reads
-        return reads is not None and not self._verifier.changed(reads, run.anchors)
+        return reads is not None and not self._verifier.changed(reads, run.base_folders)

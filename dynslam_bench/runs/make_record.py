@@ -268,7 +268,7 @@ def _notes(run: ResolvedRun) -> list[str]:
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:
     """Where a tracker is found that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
-    folder = run.anchors.plugin
+    folder = run.base_folders.plugin
     return {
         "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,
         "folder": "" if folder is None else str(folder),

@@ -13,7 +13,7 @@ from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
 from dynslam_bench.core.plugins import Registry
 from dynslam_bench.core.plugins import used as used_plugins
-from dynslam_bench.core.reads import Anchors
+from dynslam_bench.core.reads import BaseFolders
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
@@ -197,7 +197,7 @@ def segmenter_of(source: str) -> str:
     return argument if kind == "plugin" else kind
 
 
-def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
+def base_folders_of(tracker: TrackerSpec, parts: Iterable[str]) -> BaseFolders:
     """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
 
     A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the
@@ -213,15 +213,15 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
     else:
         files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if not files:
-        return Anchors(plugin=None, work=Path.cwd())
+        return BaseFolders(plugin=None, work=Path.cwd())
     # one folder stands for all, and the same one on every machine
     first = min(files, key=lambda file: (file.name, file))
-    return Anchors(plugin=first.parent, work=Path.cwd())
+    return BaseFolders(plugin=first.parent, work=Path.cwd())
 
 
-def named_part(part: str, anchors: Anchors) -> str:
+def named_part(part: str, base_folders: BaseFolders) -> str:
     """An entry point as it stands in identities: equal wherever the folder of its file lies."""
-    return anchors.name(str(Path(part).absolute())) if is_file(part) else part
+    return base_folders.name(str(Path(part).absolute())) if is_file(part) else part
 
 
 def is_file(part: str) -> bool:

@@ -181,8 +181,8 @@ def recording_options(run: ResolvedRun) -> dict[str, Any] | None:
     """What the child needs to know to record what plug-ins and programs read; None for a run without such."""
     if not run.foreign:
         return None
-    plugin = None if run.anchors.plugin is None else str(run.anchors.plugin)
-    return {"plugin": plugin, "work": str(run.anchors.work), "packages": run.plugin_packages}
+    plugin = None if run.base_folders.plugin is None else str(run.base_folders.plugin)
+    return {"plugin": plugin, "work": str(run.base_folders.work), "packages": run.plugin_packages}
 
 
 def read_reads(work_folder: Path) -> Reads | None:

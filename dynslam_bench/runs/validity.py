@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.fingerprint import named_digest
 from dynslam_bench.core.libraries import library_identity
-from dynslam_bench.core.reads import Anchors, Reads, Verifier
+from dynslam_bench.core.reads import BaseFolders, Reads, Verifier
 from dynslam_bench.runs.identity import libraries, source_digests
 from dynslam_bench.runs.own_code import is_file, is_foreign, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
@@ -108,7 +108,7 @@ class Installation:
             reads = Reads.model_validate(program.get("reads"))
         except ValidationError:
             return NOT_RECORDED
-        return self._verifier.changed(reads, Anchors(plugin=plugin, work=Path.cwd()))
+        return self._verifier.changed(reads, BaseFolders(plugin=plugin, work=Path.cwd()))
 
 
 def _difference(before: object, now: Mapping[str, str]) -> str | None:

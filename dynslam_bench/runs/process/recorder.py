@@ -47,7 +47,7 @@ from dynslam_bench.core.programs import (
 from dynslam_bench.core.reads import (
     BYTE_CODE_FOLDER,
     SEARCH_PATHS,
-    Anchors,
+    BaseFolders,
     Reads,
     content_now,
     digest_of,
@@ -98,7 +98,7 @@ class ReadRecorder:
     a time is at work.
 
     Args:
-        anchors: The folders in which names of files begin.
+        base_folders: The folders in which names of files begin.
         private: Folders of the run's own, at least one: what lies there is no input. Forked
             processes write their reads into the first one.
         plugins: Top-level names of the modules of installed plug-ins; their sources count by their
@@ -109,10 +109,10 @@ class ReadRecorder:
     """
 
     def __init__(
-        self, anchors: Anchors, *, private: Iterable[Path], plugins: Collection[str] = ()
+        self, base_folders: BaseFolders, *, private: Iterable[Path], plugins: Collection[str] = ()
     ) -> None:
         self.count = 0
-        self._anchors = anchors
+        self._base_folders = base_folders
         self._folders = list(private)
         self._plugins = plugins
         # threads in which the recorder itself is at work
@@ -159,8 +159,8 @@ class ReadRecorder:
         for folder in (*self._folders, stage_cache_folder(), digest_cache_folder()):
             private.append(f"{os.path.abspath(folder)}{os.sep}")
             private.append(f"{os.path.realpath(folder)}{os.sep}")
-        self._origins = Origins(self._anchors.plugin, self._plugins)
-        self._collector = Collector(self._anchors, self._origins, tuple(private))
+        self._origins = Origins(self._base_folders.plugin, self._plugins)
+        self._collector = Collector(self._base_folders, self._origins, tuple(private))
         self._notes = self._collector.notes
         listen(self.hear, self._handlers, self.begin_log)
 
