@@ -351,7 +351,7 @@ class Plan:
             StudyError: It names what has changed.
         """
         run = resolve(self.run_spec(self.design.tune[0], self.baseline))
-        changed = LookUp(self.store).changed(run) if run.foreign else ""
+        changed = LookUp(self.store).changed(run) if run.has_plugins_or_programs else ""
         if changed:
             raise StudyError(
                 f"study '{self.spec.name}': {changed} has changed since the baseline ran",

@@ -38,12 +38,12 @@ from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.own_code import (
     base_folders_of,
+    components_of_run,
     is_file,
-    is_foreign,
+    is_outside_package,
     module_of,
-    modules_by_part,
-    named_part,
-    parts_of_run,
+    modules_by_component,
+    portable_name,
 )
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
@@ -78,7 +78,7 @@ class ResolvedRun:
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What is asked for, and what is known beforehand of what the run will read.
         base_folders: The folders in which names of files begin that plug-ins and programs read.
-        foreign: Whether plug-ins or programs take part: what they read is known only after the run.
+        has_plugins_or_programs: Whether they take part; what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
         files: Those that the tracker's command names, in the identity by their content.
     """
@@ -91,7 +91,7 @@ class ResolvedRun:
     segmentation: str
     identity: dict[str, Any]
     base_folders: BaseFolders
-    foreign: bool = False
+    has_plugins_or_programs: bool = False
     start_map: StartMap | None = None
     files: tuple[Path, ...] = ()
 
@@ -102,7 +102,7 @@ class ResolvedRun:
 
     @cached_property
     def run_id(self) -> str:
-        """Its id; that of a run with foreign parts changes when it is known what they read."""
+        """Its id; that of a run with plug-ins or programs changes when it is known what they read."""
         return run_id_of(self.identity)
 
     @cached_property
@@ -113,7 +113,11 @@ class ResolvedRun:
     @cached_property
     def plugin_packages(self) -> list[str]:
         """The top-level names of the installed modules that take part."""
-        parts = [part for part in self.identity["parts"] if is_foreign(part) and not is_file(part)]
+        parts = [
+            part
+            for part in self.identity["parts"]
+            if is_outside_package(part) and not is_file(part)
+        ]
         return sorted({module_of(part).partition(".")[0] for part in parts})
 
     @property
@@ -197,11 +201,11 @@ class Resolver:
 
         asked = _asked(spec, configured, part, device, start_map)
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
-        entry_points = parts_of_run(
+        entry_points = components_of_run(
             tracker, settings, source, sequence, changes_frames=changes_frames
         )
         base_folders = base_folders_of(tracker, entry_points)
-        parts = sorted(named_part(entry, base_folders) for entry in entry_points)
+        parts = sorted(portable_name(entry, base_folders) for entry in entry_points)
 
         # what it will read, as far as that is known beforehand
         read = {
@@ -226,7 +230,7 @@ class Resolver:
             segmentation=source,
             identity=asked | read,
             base_folders=base_folders,
-            foreign=any(map(is_foreign, parts)) or bool(tracker.files),
+            has_plugins_or_programs=any(map(is_outside_package, parts)) or bool(tracker.files),
             start_map=start_map,
             files=files,
         )
@@ -334,7 +338,7 @@ def _files_of(
     Raises:
         DynslamError: One cannot be read.
     """
-    weights = named_digests(settings, words=is_foreign(tracker.entry_point))
+    weights = named_digests(settings, words=is_outside_package(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
@@ -354,7 +358,7 @@ def libraries() -> dict[str, str]:
 
 
 def source_digests(parts: Iterable[str]) -> dict[str, str]:
-    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
+    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_component`.
 
     Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one
     program made both.
@@ -371,7 +375,7 @@ def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, st
     """The digests that `source_digests` gives, for the modules of one graph."""
     return {
         part: graph.code_digest(modules)[:16]
-        for part, modules in modules_by_part(graph, parts).items()
+        for part, modules in modules_by_component(graph, parts).items()
     }
 
 

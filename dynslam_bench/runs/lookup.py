@@ -27,7 +27,7 @@ class LookUp:
         Of several the newest is taken: a file may have been changed and put back.
         """
         # a run of built-in parts is found by its id alone
-        if not run.foreign:
+        if not run.has_plugins_or_programs:
             record = self._store.get(run.run_id)
             if record is not None and record.identity == run.stated:
                 return record
@@ -61,7 +61,7 @@ class LookUp:
         }
         if known_before != run.stated:
             return False
-        if not run.foreign:
+        if not run.has_plugins_or_programs:
             return True
         reads = record.reads
         return reads is not None and not self._verifier.changed(reads, run.base_folders)

@@ -107,7 +107,7 @@ def run_one(
         # its frames become the files of a stored run
         frames = _write_frames(resolved, work_folder)
         check_unchanged(resolved, begun=True)
-        reads = read_reads(work_folder) if resolved.foreign else None
+        reads = read_reads(work_folder) if resolved.has_plugins_or_programs else None
         wall_s = time.perf_counter() - clock
         record = make_record(resolved, end, frames, reads, started, wall_s).normalised()
         if record.status != "stopped":
@@ -179,7 +179,7 @@ def _write_frames(run: ResolvedRun, work_folder: Path) -> FrameLog:
 
 def recording_options(run: ResolvedRun) -> dict[str, Any] | None:
     """What the child needs to know to record what plug-ins and programs read; None for a run without such."""
-    if not run.foreign:
+    if not run.has_plugins_or_programs:
         return None
     plugin = None if run.base_folders.plugin is None else str(run.base_folders.plugin)
     return {"plugin": plugin, "work": str(run.base_folders.work), "packages": run.plugin_packages}

@@ -12,7 +12,7 @@ from dynslam_bench.core.fingerprint import named_digest
 from dynslam_bench.core.libraries import library_identity
 from dynslam_bench.core.reads import BaseFolders, Reads, Verifier
 from dynslam_bench.runs.identity import libraries, source_digests
-from dynslam_bench.runs.own_code import is_file, is_foreign, module_of
+from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -99,7 +99,7 @@ class Installation:
         if file is not None:
             return f"the weights of {file}"
 
-        runs_foreign_code = "files" in program or any(map(is_foreign, parts))
+        runs_foreign_code = "files" in program or any(map(is_outside_package, parts))
         return self._what_was_read(program, plugin) if runs_foreign_code else ""
 
     def _what_was_read(self, program: Mapping[str, Any], plugin: Path | None) -> str:
