@@ -45,7 +45,7 @@ from dynslam_bench.runs.own_code import (
     modules_by_component,
     portable_name,
 )
-from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
+from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, digest_of_request, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -96,9 +96,9 @@ class ResolvedRun:
     files: tuple[Path, ...] = ()
 
     @cached_property
-    def asked(self) -> str:
+    def request_digest(self) -> str:
         """The first twelve digits of its id: what is asked for."""
-        return asked_digest(self.identity)
+        return digest_of_request(self.identity)
 
     @cached_property
     def run_id(self) -> str:

@@ -51,7 +51,7 @@ class LookUp:
 
     def _candidates(self, run: ResolvedRun) -> list[RunRecord]:
         """The stored runs of a request, whatever they have read."""
-        records = map(self._store.get, self._store.ids_of(run.asked))
+        records = map(self._store.get, self._store.ids_of(run.request_digest))
         return [record for record in records if record is not None]
 
     def _is_current(self, record: RunRecord, run: ResolvedRun) -> bool:

@@ -330,9 +330,9 @@ class RunStore:
         except (FileNotFoundError, NotADirectoryError):
             return []
 
-    def ids_of(self, asked: str) -> list[str]:
-        """Ids of the stored runs of one request, by its first twelve digits; see `record.asked_digest`."""
-        return [run_id for run_id in self.ids() if run_id.startswith(asked)]
+    def ids_of(self, request_digest: str) -> list[str]:
+        """Ids of the stored runs of one request, by its first twelve digits; see `record.digest_of_request`."""
+        return [run_id for run_id in self.ids() if run_id.startswith(request_digest)]
 
     def read(self, run_id: str) -> RunRecord:
         """The record of a run by its id, the id's first digits, or ``latest``.

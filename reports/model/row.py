@@ -148,7 +148,7 @@ class RunRow(RunRecord):
     @cached_property
     def variant(self) -> dict[str, Any]:
         """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
-        variant: dict[str, Any] = dict(sorted(self.asked.items()))
+        variant: dict[str, Any] = dict(sorted(self.requested_settings.items()))
         if not self.imported:
             variant |= {"device": self.device, "threads": self.threads}
         if self.realtime:
