@@ -241,7 +241,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._parts = observation_parts(observation)
+        self._observation_parts = observation_parts(observation)
         self._observation = observation
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
         self._length = window
@@ -472,7 +472,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.close()
         self._canvas = None
         vars(self).update(parts)
-        self.sequence = _part(self._whole, self.window)
+        self.sequence = _frames_of_window(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
         """What an episode's state depends on, in words; equal where it can be restored."""
@@ -638,7 +638,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._use_sequence(options["sequence"])
             size = (camera.width, camera.height)
             new_size = (self.sequence.camera.width, self.sequence.camera.height)
-            if {"rgb", "depth"} & set(self._parts) and size != new_size:
+            if {"rgb", "depth"} & set(self._observation_parts) and size != new_size:
                 raise SequenceError(
                     f"images of {new_size} pixels do not fit the observation space of {size}"
                 )
@@ -654,7 +654,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             if self._whole.masks is not None:
                 # the tracker may hold the exact masks, which are numbered as the frames
                 self.close()
-            self.sequence = _part(self._whole, window)
+            self.sequence = _frames_of_window(self._whole, window)
             self.window = window
 
     def _build_or_reuse_tracker(self) -> Tracker:
@@ -766,7 +766,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _observe(self) -> Any:
         """The observation of the last tracked frame: the vector for ``stats``, else a dict of parts."""
         progress = self.episode.outcomes[-1].index / max(self._n_frames - 1, 1)
-        observed = observe(self._parts, self.frame, self.result, self.episode, progress)
+        observed = observe(self._observation_parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 
     def _info(self) -> dict[str, Any]:
@@ -777,7 +777,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return fixed_info(info, self.protocol) if self._fixed_info else info
 
 
-def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
+def _frames_of_window(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames of a window."""
     if window == (0, len(whole)):
         return whole

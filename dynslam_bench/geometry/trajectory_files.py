@@ -223,7 +223,7 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
             heading = parse_heading(text)
             commented += [] if heading is None else [heading]
             continue
-        parts = _parts(text)
+        parts = _fields(text)
         if not parts:
             continue
         # the first row, or a heading that is no comment
@@ -362,12 +362,12 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             raise TrajectoryError(
                 f"{path} has more than {MOST_LINES} lines, too many for a trajectory"
             )
-        parts = _parts(line)
+        parts = _fields(line)
         if parts:
             yield number, parts
 
 
-def _parts(line: str) -> list[str]:
+def _fields(line: str) -> list[str]:
     """What stands in a line before a comment, split at commas and spaces."""
     return line.partition("#")[0].replace(",", " ").split()
 

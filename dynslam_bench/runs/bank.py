@@ -66,7 +66,7 @@ class Bank(RunStore):
             RunError: It was removed or changed while it was copied.
         """
         # the sequence's stamps and ground truth, shared by its runs
-        self.copy_part(other, record)
+        self.copy_stamps_and_truth(other, record)
         with self.work_folder(record.run_id) as work:
             # the run's own files, read while nobody changes them
             with self.copying(other, record):

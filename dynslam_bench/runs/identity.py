@@ -50,7 +50,7 @@ from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import PreprocessingSettings
-from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.sequences.view import SequencePart, sequence_part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
@@ -165,7 +165,7 @@ class Resolver:
 
     def __init__(self) -> None:
         self._whole = lru_cache(maxsize=None)(open_frames)
-        self._part = lru_cache(maxsize=None)(self._open_part)
+        self._opened_part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
         self._libraries = lru_cache(maxsize=None)(libraries)
         self._configurations: dict[str, _Configuration] = {}
@@ -189,7 +189,7 @@ class Resolver:
 
         # the frames
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
-        sequence, part = self._part(where, spec.frames_seen, spec.stride, spec.offset)
+        sequence, part = self._opened_part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
         check_degradation(spec.degrade)
         device = self._device(spec.device)
@@ -257,13 +257,13 @@ class Resolver:
         frames: tuple[int, int | None] | None,
         stride: int,
         offset: int,
-    ) -> tuple[Sequence, Part]:
+    ) -> tuple[Sequence, SequencePart]:
         """Checked frames of a sequence, and what part of it they are."""
         name, data_root, camera, preprocessing = where
         whole = self._whole(name, data_root, camera, None, 1, preprocessing)
         sequence = open_frames(whole, None, None, frames, stride)
         check_frames(sequence)
-        return sequence, part_of(sequence, offset)
+        return sequence, sequence_part_of(sequence, offset)
 
 
 def check_degradation(strengths: Mapping[str, float]) -> None:
@@ -297,7 +297,7 @@ def _configure(spec: RunSpec, key: str) -> _Configuration:
 def _asked(
     spec: RunSpec,
     configured: _Configuration,
-    part: Part,
+    part: SequencePart,
     device: str,
     start_map: StartMap | None,
 ) -> dict[str, Any]:

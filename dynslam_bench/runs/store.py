@@ -232,7 +232,7 @@ class RunStore:
             InfrastructureError: It cannot be written.
             RunError: It was removed or changed while it was copied.
         """
-        self.copy_part(other, record)
+        self.copy_stamps_and_truth(other, record)
         with self.work_folder(record.run_id) as work:
             with self.copying(other, record):
                 shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
@@ -273,7 +273,7 @@ class RunStore:
                     f"{name} of run {record.run_id} was removed or changed while it was copied"
                 )
 
-    def copy_part(self, other: RunStore, record: RunRecord) -> None:
+    def copy_stamps_and_truth(self, other: RunStore, record: RunRecord) -> None:
         """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here.
 
         Raises:

@@ -202,11 +202,13 @@ def smooth(
     cuts = np.flatnonzero(np.diff(stamps) > MAX_GAP_S) + 1
     for rows in np.split(np.arange(len(stamps)), cuts):
         if len(rows) > 2:
-            out[rows] = _smooth_part(stamps[rows], T_cam_world[rows], covariances[rows], settings)
+            out[rows] = _smooth_segment(
+                stamps[rows], T_cam_world[rows], covariances[rows], settings
+            )
     return out
 
 
-def _smooth_part(
+def _smooth_segment(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
     """`smooth` within a part without gaps."""

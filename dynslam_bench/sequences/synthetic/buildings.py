@@ -16,7 +16,7 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, cos, norm, sin
 from dynslam_bench.sequences.synthetic.camera_paths import Walk, walk_along, walking_camera
-from dynslam_bench.sequences.synthetic.parts import Parts, box, copies, rotation_about_z
+from dynslam_bench.sequences.synthetic.parts import Primitives, box, copies, rotation_about_z
 from dynslam_bench.sequences.synthetic.rooms import (
     Point,
     cartons,
@@ -68,7 +68,7 @@ class _LoosePiece(NamedTuple):
     """
 
     kind: str
-    parts: Parts
+    parts: Primitives
     yaw: float
     at: Point
 
@@ -87,11 +87,13 @@ class _Building:
 
     scene: int
     repeated: bool
-    parts: Parts = field(default_factory=list)
+    parts: Primitives = field(default_factory=list)
     loose: list[_LoosePiece] = field(default_factory=list)
     bays: int = 0
 
-    def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
+    def bay(
+        self, make: Callable[[int, int], Primitives], yaw: float, at: Point, alike: int = 0
+    ) -> None:
         """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
         number = alike if self.repeated else self.bays
         self.parts += copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")

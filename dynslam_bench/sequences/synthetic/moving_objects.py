@@ -14,7 +14,7 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import cos
 from dynslam_bench.sequences.synthetic.camera_paths import camera_poses
-from dynslam_bench.sequences.synthetic.parts import At, Key, Parts, box, copies, on_track
+from dynslam_bench.sequences.synthetic.parts import At, Key, Primitives, box, copies, on_track
 from dynslam_bench.sequences.synthetic.people import Draw, draw_person, posture
 from dynslam_bench.sequences.synthetic.rooms import (
     Plan,
@@ -67,7 +67,7 @@ def build_objects(variant: str, scene: int) -> World:
 
 
 def _body(
-    id: int, name: str, parts: Parts, keys: tuple[At, ...], period: float | None = PERIOD_S
+    id: int, name: str, parts: Primitives, keys: tuple[At, ...], period: float | None = PERIOD_S
 ) -> Body:
     """A thing that moves along a timeline."""
     return Body(id, name, parts, partial(on_track, keys, period))
@@ -262,7 +262,7 @@ def _door(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "door", door_leaf(1, plan, width), keys),))
 
 
-def _doorway(plan: Plan) -> Parts:
+def _doorway(plan: Plan) -> Primitives:
     """A wall before the desk, with a doorway, and posters on it."""
     x, y, width = _DOOR
     # walls on either side of the door
