@@ -44,7 +44,9 @@ def in_moving_region(
     share: float,
     size: tuple[int, ...],
 ) -> NDArray[np.bool_]:
-    """The region rule: failing points of whose tested neighbours enough fail too.
+    """The region rule: failing points in whose neighbourhood enough of the tested points fail.
+
+    The neighbourhood is 5 x 5 cells of 16 px at an image width of 640.
 
     Args:
         failing: bool ``[N]``, points that failed a test.

@@ -171,7 +171,7 @@ def nearby_mean(
 def nearest_depth(
     depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """The depth in the 3x3 patch around each raw pixel that is nearest to the expected depth.
+    """Of the depths in the 3x3 patch around each raw pixel, the one closest to `expected`.
 
     Thus depth edges and sub-pixel flow errors do not count as motion.
 

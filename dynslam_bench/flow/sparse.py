@@ -178,16 +178,23 @@ class SparseDaisyFlow:
     def forward_backward_error(
         self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
     ) -> NDArray[np.float32]:
-        """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to."""
+        """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to.
+
+        Args:
+            points: ``[N, 2]``, full-image pixels of the reference.
+            labels: ``[N, 4]``: dx, dy (pixels), log2 of the scale, rotation (radians).
+            pair: The reference and the target.
+        """
         count = len(points)
-        # from the ends, by the inverse label, with one image in the place of the other
+        # back from each end: target and reference swapped. The label's inverse is its negative, and the
+        # kernel refines it in place
         ends = points + labels[:, :2]
         inverse = -labels
         window = Window(1, self.settings.refinement_window_px // 2, margin=BACKWARD_MARGIN, warps=1)
-        correlation = np.empty(count, np.float32)
+        unused_correlation = np.empty(count, np.float32)
         images = (pair.target.framed, pair.reference.framed)
         self.workers.run(
-            similarity_lucas_kanade, 0, count, ends, inverse, *images, window, correlation
+            similarity_lucas_kanade, 0, count, ends, inverse, *images, window, unused_correlation
         )
         error: NDArray[np.float32] = np.hypot(*(ends + inverse[:, :2] - points).T)
         return error

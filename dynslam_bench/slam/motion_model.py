@@ -56,12 +56,12 @@ _START_SPEED = np.repeat([1.0, 2.0], 3)
 
 
 def pose_covariance(T_cam_world: Array, information: Array, inflation: float = INFLATION) -> Array:
-    """Covariance ``[6, 6]`` of (position in the world, rotation in the camera frame) of a measured pose.
+    """Covariance ``[6, 6]`` of a measured pose: position in the world (m), rotation in the camera frame (rad).
 
     Args:
         T_cam_world: The measured world-to-camera pose.
         information: Gauss-Newton matrix of (translation, rotation) for ``exp(xi) @ T_cam_world``.
-        inflation: Factor on the covariance.
+        inflation: Factor on the covariance, see `INFLATION`.
     """
     # derivative of the twist by (position in the world, rotation in the camera frame)
     j = np.zeros((6, 6))

@@ -523,11 +523,12 @@ def is_aliased(
     Args:
         slam_map: The map.
         observations: The features.
-        hypotheses: The frame's pose by submap, as far as it is known.
-        keyframes: Slots of the keyframes whose places may be others.
+        hypotheses: Known poses of the frame: submap number to pose.
+        keyframes: Slots of the keyframes that are searched for a second place.
         settings: Settings of tracking.
         seed: Seed of RANSAC's draws.
-        possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
+        possible: Called with a submap's number and ``T_cam_world``; False where the camera cannot be
+            (`MotionBound.admits`).
     """
     min_share = ALIASING_SHARE * max(place.seen_share for place in hypotheses.values())
     for submap in np.unique(slam_map.kf_map[keyframes]).tolist():

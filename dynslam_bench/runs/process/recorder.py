@@ -70,7 +70,8 @@ _FIRST_LOOK_S = 0.02
 _LOOK_S = 0.5
 """Seconds between two looks at the programs when the first ones are over; each comes after twice the time."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
-"""Number of the clock that stamps files, the coarse one; it moves on every 1 to 10 ms."""
+"""Number of the clock that stamps files: CLOCK_REALTIME_COARSE, which Python does not name. It moves on every 1 to 10
+ms."""
 _CLOCK_LAG_NS = 10_000_000
 """So far the clock that stamps files may be behind that of the system."""
 _ADAPTERS = "dynslam_bench.trackers.adapters"
@@ -503,7 +504,7 @@ class ReadRecorder:
             texts += _WORD_OF_CODE.findall(texts[texts.index("-c", 1) + 1])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
-            self._notes.commands[command] = _time_after_files_so_far()
+            self._notes.commands[command] = _program_start_ns()
             self._note("command", json.dumps([texts, command.folder]))
         self._note_variables(RESULT_VARIABLES)
         if self._watcher is None:
@@ -615,9 +616,10 @@ def _path_of_descriptor(descriptor: int) -> str | None:
     return path if is_file_name(path) else None
 
 
-def _time_after_files_so_far() -> int:
-    """A time in nanoseconds that is later than the stamps of all files written so far, and not of those written next.
+def _program_start_ns() -> int:
+    """The time (ns) that separates files written before a program starts from those written after.
 
+    The former may be its inputs, the latter its outputs.
     It waits for the next tick of the clock that stamps files. Where that clock cannot be read it
     gives the time less the most that the clock may be behind: files of the last moments then count
     as written next.

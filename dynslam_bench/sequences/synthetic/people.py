@@ -497,9 +497,9 @@ def _leg(figure: _Figure, side: int, index: int) -> Primitives:
 
 Draw = Callable[[float, float], float]
 """A number between two limits, drawn from a scene's stream."""
-_STRIDE_M = 1.35
+STRIDE_M = 1.35
 """Path of two steps, in which the gait's phase advances by 2 pi."""
-_FULL_GAIT_M_S = 0.9
+FULL_GAIT_M_S = 0.9
 """Speed from which a person walks at full stride."""
 
 
@@ -671,8 +671,8 @@ def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
         x=before.x + eased * (after.x - before.x),
         y=before.y + eased * (after.y - before.y),
         facing=facing,
-        stride=(walked + distance * eased) * 2 * math.pi / _STRIDE_M,
-        gait=min(speed / _FULL_GAIT_M_S, 1.0),
+        stride=(walked + distance * eased) * 2 * math.pi / STRIDE_M,
+        gait=min(speed / FULL_GAIT_M_S, 1.0),
         sit=before.sit + eased * (after.sit - before.sit),
         gesture=before.gesture + eased * (after.gesture - before.gesture),
         clock=t,

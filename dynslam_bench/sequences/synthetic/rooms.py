@@ -511,14 +511,15 @@ def corridor_bay(scene: int, number: int) -> Primitives:
     return parts
 
 
-def notices(scene: int, number: int) -> Primitives:
-    """Nearly two metres of wall with four sheets on it at different heights."""
+def notice_bay(scene: int, number: int) -> Primitives:
+    """Two metres of wall along y = 0 with four sheets, 1.15 to 1.75 m high; `number` seeds the draw."""
     rng = stream(scene, "synthetic", "notices", number)
     parts = []
     for k in range(4):
-        half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
+        # upright or lying, metres
+        half_extents = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
         at = (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random())
-        parts.append(box(_EYE, at, half, texture=f"poster:{k}", fit=(2,)))
+        parts.append(box(_EYE, at, half_extents, texture=f"poster:{k}", fit=(2,)))
     return parts
 
 
