@@ -86,7 +86,7 @@ def epipolar_distance(matrix: NDArray[np.float64], x1: Points, x2: Points) -> Po
     return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
 
 
-class Matches(NamedTuple):
+class FlowMatches(NamedTuple):
     """Keypoints and where their flow ends, undistorted pixels.
 
     Attributes:
@@ -120,7 +120,7 @@ class Matches(NamedTuple):
 
 def matches_by_flow(
     frame: FrameBundle, state: FilterState, unmatched: Unmatched | None = None
-) -> Matches | None:
+) -> FlowMatches | None:
     """The keypoints' matches; None without flow or without a previous frame.
 
     Args:
@@ -138,7 +138,7 @@ def matches_by_flow(
         tested = state.keep & np.isfinite(flow.xy).all(axis=1)
     else:
         tested = state.keep & flow.valid
-    return Matches(state.flow_xy, frame.xy, flow.valid, tested)
+    return FlowMatches(state.flow_xy, frame.xy, flow.valid, tested)
 
 
 class EpipolarFilter(BaseFilter[EpipolarSettings]):
@@ -253,7 +253,7 @@ def homography_share(x1: Points, x2: Points) -> float:
 
 
 def contradiction_share(
-    frame: FrameBundle, state: FilterState, failing: Flags, matches: Matches
+    frame: FrameBundle, state: FilterState, failing: Flags, matches: FlowMatches
 ) -> float:
     """Share of the points that fit the camera's motion in depth and fail the epipolar test.
 

@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.gate import (
     CLIP,
     LOOKS,
     ONE_LOOK,
-    Estimate,
+    GateEstimate,
     GateVerdict,
     decide,
     is_lost_more,
@@ -50,7 +50,7 @@ class Findings(NamedTuple):
     """
 
     verdict: GateVerdict
-    estimate: Estimate | None
+    estimate: GateEstimate | None
     level: float
     lost: tuple[int, int]
     cases: list[CaseResult]

@@ -48,8 +48,8 @@ from dynslam_bench.runs.layout import (
     RUN_FILE,
     STAMPS,
     TRUTH,
+    TrajectoryKind,
     Unreadable,
-    Which,
     check_plain,
     checked_id,
     file_stamp,
@@ -499,7 +499,7 @@ class RunStore:
 
     def _evaluate(self, record: RunRecord, protocol: Protocol) -> MetricRecord:
         """Evaluate both trajectories of a run, and say why one cannot be evaluated."""
-        evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
+        evaluations: dict[TrajectoryKind, Evaluation | None] = {"online": None, "final": None}
         reasons: dict[str, str] = {}
         hint_lines: list[str] = []
         for which in evaluations:
@@ -523,14 +523,14 @@ class RunStore:
             hints=hint_lines,
         )
 
-    def _scored_trajectory(self, record: RunRecord, protocol: Protocol) -> Which:
+    def _scored_trajectory(self, record: RunRecord, protocol: Protocol) -> TrajectoryKind:
         """The trajectory that the protocol asks for, or the only one that a run has."""
         if record.kind == "imported":
             return "online" if (self.folder(record.run_id) / ONLINE).is_file() else "final"
         return protocol.trajectory if record.tracker.online else "final"
 
     def _inputs(
-        self, record: RunRecord, protocol: Protocol, which: Which
+        self, record: RunRecord, protocol: Protocol, which: TrajectoryKind
     ) -> tuple[Trajectory, Trajectory, NDArray[np.float64] | None]:
         """What one of a run's trajectories is evaluated with.
 

@@ -38,7 +38,7 @@ from dynslam_bench.runs.exchange.formats import (
     write_pose_table,
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
-from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.layout import TrajectoryKind
 from dynslam_bench.runs.make_record import judge_coverage, sequence_info, sequence_part_digest
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.spec import place_of
@@ -71,7 +71,7 @@ class Exported:
 
     folder: Path
     files: tuple[str, ...]
-    which: Which
+    which: TrajectoryKind
     notes: tuple[str, ...]
 
 
@@ -81,7 +81,7 @@ def export_run(
     folder: str | Path | None = None,
     *,
     results: str | Path | RunStore = "results",
-    which: Which | None = None,
+    which: TrajectoryKind | None = None,
     data_root: str | Path | None = None,
     camera: str | Path | None = None,
 ) -> Exported:
@@ -147,14 +147,14 @@ def _is_replaceable(folder: Path) -> bool:
 
 
 def _trajectory(
-    store: RunStore, record: RunRecord, which: Which | None
-) -> tuple[Which, Trajectory]:
+    store: RunStore, record: RunRecord, which: TrajectoryKind | None
+) -> tuple[TrajectoryKind, Trajectory]:
     """The trajectory of a run that is exported, and which it is; by default the final one, else the online one.
 
     Raises:
         RunError: The run has no such trajectory.
     """
-    wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
+    wanted: tuple[TrajectoryKind, ...] = ("final", "online") if which is None else (which,)
     for kind in wanted:
         if trajectory := store.trajectory(record.run_id, kind):
             return kind, trajectory
@@ -168,7 +168,7 @@ def _write(
     work: Path,
     store: RunStore,
     record: RunRecord,
-    which: Which,
+    which: TrajectoryKind,
     trajectory: Trajectory,
     reopened: Callable[[], Sequence],
 ) -> list[str]:
@@ -274,7 +274,7 @@ class Provenance(Record):
     schema_version: int = 1
     format: str
     files: dict[str, str]
-    which: Which
+    which: TrajectoryKind
     run: RunRecord
     written_by: str = ""
 
@@ -356,7 +356,7 @@ def import_trajectory(
     results: str | Path | RunStore = "results",
     label: str = "",
     provenance: str = "",
-    which: Which = "final",
+    which: TrajectoryKind = "final",
     frames: Frames = None,
     stride: int = 1,
     data_root: str | Path | None = None,

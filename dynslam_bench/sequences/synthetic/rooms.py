@@ -24,7 +24,7 @@ from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
 
 
 @dataclass(frozen=True)
-class Plan:
+class RoomPlan:
     """Sizes, places and colours of the room of a scene.
 
     Attributes:
@@ -68,7 +68,7 @@ def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
     return half[int(rng.integers(len(half)))]
 
 
-def plan_room(scene: int, number: int | None = None) -> Plan:
+def plan_room(scene: int, number: int | None = None) -> RoomPlan:
     """Draw the plan of a scene's room, or of one of its several rooms."""
     # the stream of draws; a scene's only room and its first of several are different rooms
     one_of_several = () if number is None else (number,)
@@ -95,7 +95,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
         "bin": color(0.2, 0.6, 0.4),
     }
     # sizes and places, in this order of draws
-    return Plan(
+    return RoomPlan(
         back_y=pick(rng, scene, 3.35, 3.75),
         left_x=-pick(rng, scene, 1.9, 2.4),
         right_x=pick(rng, scene, 1.9, 2.4),
@@ -109,7 +109,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
-def glare_window(plan: Plan) -> tuple[float, float, float]:
+def glare_window(plan: RoomPlan) -> tuple[float, float, float]:
     """The place beside the back wall where glare comes from, metres."""
     return plan.left_x * 0.55, plan.back_y, 2.15
 
@@ -124,7 +124,7 @@ _EYE = np.eye(3)
 """Rotation of what stands along the world's axes."""
 
 
-def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Primitives:
+def desk(rng: np.random.Generator, plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
     return [
         *_table(plan, x, y, half),
@@ -136,7 +136,7 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
     ]
 
 
-def _table(plan: Plan, x: float, y: float, half: float) -> Primitives:
+def _table(plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """The top of a desk, its sides and back, and a unit of three drawers."""
     tint = plan.tints
     wood: Style = {"texture": "wood", "tint": tint["desk"]}
@@ -214,7 +214,7 @@ def _mugs(rng: np.random.Generator, x: float, y: float) -> Primitives:
     return parts
 
 
-def _lamp(plan: Plan, x: float, y: float, half: float) -> Primitives:
+def _lamp(plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """Foot, rod and shade of a lamp, at the end without drawers."""
     tint = plan.tints
     side = 1 if plan.mirrored else -1
@@ -235,7 +235,9 @@ _FRAME = (
 """Bars around a monitor's picture: middle and half extents along both of its sides, metres."""
 
 
-def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Primitives:
+def _monitors(
+    rng: np.random.Generator, plan: RoomPlan, x: float, y: float, half: float
+) -> Primitives:
     """Monitors, each with its foot, a keyboard and a mouse."""
     plastic = plan.tints["plastic"]
     spacing = 2 * half / (plan.monitors + 0.6)
@@ -266,7 +268,7 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
     return parts
 
 
-def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Primitives:
+def shelf(rng: np.random.Generator, plan: RoomPlan, side: int) -> Primitives:
     """A bookcase against the back wall with rows of books and boxes."""
     wood: Style = {"texture": "wood", "tint": plan.tints["shelf"]}
     darker: Style = wood | {"tint": plan.tints["shelf"] * 0.8}
@@ -304,7 +306,7 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Primitives:
     return parts
 
 
-def posters(rng: np.random.Generator, plan: Plan) -> Primitives:
+def posters(rng: np.random.Generator, plan: RoomPlan) -> Primitives:
     """Posters on the back wall."""
     parts = []
     span = plan.right_x - plan.left_x - 1.6
@@ -316,7 +318,7 @@ def posters(rng: np.random.Generator, plan: Plan) -> Primitives:
     return parts
 
 
-def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Primitives:
+def cabinet(rng: np.random.Generator, plan: RoomPlan, side: int) -> Primitives:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
     tint = plan.tints
     y = plan.back_y - 0.25
@@ -361,7 +363,7 @@ def _plant(rng: np.random.Generator, pot: Array) -> Primitives:
     return parts
 
 
-def build_room(scene: int, plan: Plan) -> Primitives:
+def build_room(scene: int, plan: RoomPlan) -> Primitives:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     # extents of the room
     rng = stream(scene, "synthetic", "furniture")
@@ -417,7 +419,7 @@ _LINTEL_M = 2.1
 Point = tuple[float, float]
 
 
-def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Primitives:
+def floor(low: Point, high: Point, plan: RoomPlan, shift: Point = (0.0, 0.0)) -> Primitives:
     """Floor and ceiling of a rectangle; `shift` is that of the carpet's texture."""
     middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
     half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
@@ -430,7 +432,9 @@ def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Pri
     ]
 
 
-def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> Primitives:
+def partition(
+    start: Point, end: Point, plan: RoomPlan, doors: tuple[float, ...] = ()
+) -> Primitives:
     """A wall 0.1 m thick with doorways.
 
     Args:
@@ -461,7 +465,7 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
     return parts
 
 
-def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
+def _stretch(scene: int, number: int, half: float) -> tuple[RoomPlan, np.random.Generator]:
     """The plan of a stretch of wall along y = 0, from x = -half to half, and the stream of its draws.
 
     Args:
@@ -533,7 +537,7 @@ _PRINT: Style = {
 }
 
 
-def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Primitives:
+def office_chair(plan: RoomPlan, instance: int, shade: float = 1.0) -> Primitives:
     """An office chair facing -y: seat, back, column, five-pointed base; the origin lies on the floor."""
     metal = plan.tints["metal"]
     hub = np.array([0, 0, 0.09])
@@ -608,7 +612,7 @@ def balloon(id: int, radius: float) -> Primitives:
     ]
 
 
-def trolley(id: int, scene: int, plan: Plan) -> Primitives:
+def trolley(id: int, scene: int, plan: RoomPlan) -> Primitives:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
     rng = stream(scene, "synthetic", "trolley")
     bottom = 0.18
@@ -631,7 +635,7 @@ def trolley(id: int, scene: int, plan: Plan) -> Primitives:
     return parts
 
 
-def door_leaf(id: int, plan: Plan, width: float) -> Primitives:
+def door_leaf(id: int, plan: RoomPlan, width: float) -> Primitives:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
     wood: Style = {"instance": id, "texture": "wood", "tint": plan.tints["door"]}
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}

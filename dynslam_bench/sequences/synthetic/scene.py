@@ -191,7 +191,7 @@ class Scene:
         """How frame `index` sees the scene."""
 
     @cached_property
-    def atlas(self) -> textures.Atlas:
+    def atlas(self) -> textures.TextureAtlas:
         """The scene's textures; drawn when the first frame is coloured."""
         drawn = []
         for name in self.texture_names:
