@@ -475,7 +475,9 @@ class Map:
             scale_factor,
             len(self.scales),
         )
-        return VisiblePoints(index[:count], uv[:count], right[:count], octave[:count], cosine[:count])
+        return VisiblePoints(
+            index[:count], uv[:count], right[:count], octave[:count], cosine[:count]
+        )
 
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
         """A keyframe's close points, and how many of them three other keyframes see, at most one octave coarser.
