@@ -80,7 +80,7 @@ class Configuration(NamedTuple):
     settings: Mapping[str, Any]
 
 
-FOREIGN = "transfer"
+EXTERNAL_STAGE = "transfer"
 """Stage that only trackers in another program have."""
 
 
@@ -124,7 +124,7 @@ def outcome(
 
     # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
-    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
+    elsewhere = record.device.startswith("cuda") or EXTERNAL_STAGE in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
     period_s = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     return Outcome(

@@ -48,6 +48,7 @@ from dynslam_bench.runs.rows import part_words
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.sequences.families import family_of, same_path
 from dynslam_bench.sequences.tags import FIXED_CAMERA
+from dynslam_bench.sequences.thumbnails import same_frames
 
 STATIC_CAMERA = "static camera (from ground truth)"
 """What captions call the reference where it is a static camera."""
@@ -723,7 +724,7 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: the true poses are the same, and the camera moves.
+    """Which sequences are others once more: the true poses are the same, or the pictures before a fixed camera.
 
     Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
@@ -741,15 +742,20 @@ def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
         if not with_truth:
             continue
         first = min(with_truth, key=lambda row: (row.imported, row.offset))
-        if (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M:
-            continue
+        is_fixed = (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M
+        is_same = _has_same_pictures if is_fixed else _is_same_path
         for other, other_row in firsts.items():
-            if _is_same_path(first, other_row):
+            if is_same(first, other_row):
                 copies[name] = other
                 break
         else:
             firsts[name] = first
     return copies
+
+
+def _has_same_pictures(row: RunRow, other: RunRow) -> bool:
+    """Whether two runs are on one recording, whose camera never moves."""
+    return same_frames(row.sequence.thumbnails, other.sequence.thumbnails)
 
 
 def _is_same_path(row: RunRow, other: RunRow) -> bool:
@@ -787,7 +793,8 @@ def copies_note(board: Board) -> str:
         return ""
     return (
         f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: equal poses, or "
-        "as many frames, the same duration, and the same error of a static camera."
+        "as many frames, the same duration, and the same error of a static camera. Before a fixed camera, "
+        "frames spread over both show the same."
     )
 
 

@@ -1,5 +1,6 @@
 """Who is ranked: systems that beat a static camera, real-time runs among themselves, monocular runs by scale."""
 
+import base64
 import json
 
 import numpy as np
@@ -468,6 +469,26 @@ def test_sequences_of_a_fixed_camera_are_never_one():
     board = make_board(rows)
     assert board.common == ["s", "t"]
     assert not board.copies
+
+
+def test_a_fixed_camera_by_two_names_is_one_sequence_where_its_pictures_are_equal():
+    """The true path stands still and tells nothing; the pictures of frames do."""
+    still = {"duration_s": 2.5, "static_camera_ate_rmse_m": 0.0, "tags": ["fixed-camera"]}
+    rng = np.random.default_rng(3)
+    filmed = rng.integers(0, 240, (6, 192), dtype=np.uint8)
+    others = rng.integers(0, 240, (6, 192), dtype=np.uint8)
+    shown = {"man": filmed, "man_jpeg": filmed + np.uint8(2), "woman": others}
+    rows = []
+    for name, pictures in shown.items():
+        encoded = [base64.b64encode(picture).decode() for picture in pictures]
+        for tracker in ("orb-slam2", "b"):
+            run = row(tracker, name, 0.1, **still)
+            sequence = run.sequence.model_copy(update={"thumbnails": encoded})
+            rows.append(run.model_copy(update={"sequence": sequence}))
+    board = make_board(rows)
+    assert board.copies == {"man_jpeg": "man"}
+    assert board.common == ["man", "woman"]
+    assert "man counts once for man, man_jpeg" in copies_note(board)
 
 
 def test_exact_masks_are_a_bound_and_never_rank_beside_others():
