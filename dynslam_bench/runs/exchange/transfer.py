@@ -418,8 +418,10 @@ def import_trajectory(
     coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{part.id}'")
     if not reference.knows_frames:
         coverage = _Coverage.of_all(len(trajectory), coverage.n_without_frame)
+        span = _share_of_time(trajectory.timestamps, stamps_s)
         notes.append(
-            "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
+            "coverage is unknown: the images of the sequence were not here, and so its frames are not known; "
+            f"from its first to its last pose are {100 * span:.0f} % of the ground truth's time"
         )
     elif coverage.n_without_frame:
         notes.append(
@@ -578,6 +580,14 @@ class _Coverage(NamedTuple):
     def of_all(cls, poses: int, n_without_frame: int) -> _Coverage:
         """Each pose counts as a frame: the frames are not known."""
         return cls(poses, poses, n_without_frame, poses - 1)
+
+
+def _share_of_time(stamps: Array, true_stamps: Array) -> float:
+    """The share of the ground truth's time between the first and the last pose; both stamps in seconds."""
+    start = max(float(stamps[0]), float(true_stamps[0]))
+    stop = min(float(stamps[-1]), float(true_stamps[-1]))
+    whole = float(true_stamps[-1] - true_stamps[0])
+    return max(stop - start, 0.0) / whole if whole > 0 else 1.0
 
 
 def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> _Coverage:
