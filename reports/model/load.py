@@ -58,7 +58,7 @@ def _score_run(store: RunStore, protocol: Protocol, run_id: str) -> tuple[RunRow
         record, state = store.read_with_state(run_id)
         return make_row(store, record, protocol), state
     except DynslamError as error:
-        return f"{store.place(run_id)}: {error}"
+        return f"{store.shown_folder(run_id)}: {error}"
 
 
 def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow, str]]) -> None:
