@@ -95,12 +95,12 @@ def write_run_pages(
     newest = sorted(rows, key=lambda row: row.started, reverse=True)
     newest.sort(key=lambda row: row.offset)
     shares = {}
-    for column, runs in grouped(newest, lambda row: row.column_id).items():
+    for column, runs in grouped(newest, lambda row: row.sequence_key).items():
         shares[column] = exact_shares(runs)
 
     # write the pages, those of one column after each other
     jobs = []
-    for column, runs in grouped(rows, lambda row: row.column_id).items():
+    for column, runs in grouped(rows, lambda row: row.sequence_key).items():
         for row in runs:
             jobs.append((row, row.run_id in pictured, shares[column], protocol, output))
     pages: list[RunPage] = []
