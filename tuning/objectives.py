@@ -555,6 +555,19 @@ def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     }
 
 
+def scene_errors_m(outcomes: Outcomes) -> dict[str, float]:
+    """ATE in metres in each scene: the median over the starts at each place, the geometric mean over its places.
+
+    The quotient of two configurations that ran from the same starts is their ratio by `by_scene`.
+    """
+    errors = {instance: run.ate_m for instance, run in outcomes.items()}
+    medians = {place: float(np.median(logs)) for place, logs in log_errors(errors).items()}
+    return {
+        scene: math.exp(fmean(medians[place] for place in places))
+        for scene, places in scenes(medians).items()
+    }
+
+
 def centre(values: Iterable[float]) -> float:
     """Mean of log ratios over scenes, which a search makes small: losses count in full."""
     return fmean(values)

@@ -243,7 +243,6 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 
-@kernel
 def _align(
     start: Array,
     points: Array,

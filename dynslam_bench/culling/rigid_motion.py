@@ -122,7 +122,6 @@ class RigidMotionFilter(BaseFilter[RigidMotionSettings]):
         return ~(distance <= self.settings.threshold_px + allowed) | off_depth, residual, allowed
 
 
-@kernel
 def nearby_mean(
     xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats, nearby_px: float
 ) -> Array:
@@ -139,33 +138,45 @@ def nearby_mean(
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
     """
-    # sorted by rows, so that few points are compared
-    order = np.argsort(xy[:, 1])
-    columns = xy[order, 0].copy()
-    rows = xy[order, 1].copy()
-    depths = z[order]
-    sorted_values = values[order]
+    # sorted by rows, so that few points are compared: from the first row that may be near
+    order = np.argsort(xy[:, 1], kind="stable")
+    first = np.searchsorted(xy[order, 1], at[:, 1].astype(np.float64) - nearby_px)
     means = np.zeros((len(at), values.shape[1]))
+    _fill_nearby_mean(xy[order], z[order], values[order], at, at_z, first, nearby_px, means)
+    return means
+
+
+@kernel
+def _fill_nearby_mean(
+    xy: Floats,
+    z: Floats,
+    values: Array,
+    at: Floats,
+    at_z: Floats,
+    first: NDArray[np.int64],
+    nearby_px: float,
+    means: Array,
+) -> None:
+    """Add the means ``[M, K]`` of points that are sorted by rows; `first` ``[M]`` is the first that may be near."""
     for i in range(len(at)):
-        # the rows that may be near, from the first one on
         column = at[i, 0]
         depth = at_z[i]
         tolerance = SIMILAR_DEPTH * at_z[i]
         last = at[i, 1] + nearby_px
         count = 0
-        for k in range(np.searchsorted(rows, at[i, 1] - nearby_px), len(rows)):
-            if rows[k] > last:
+        for k in range(first[i], len(xy)):
+            if xy[k, 1] > last:
                 break
             # add up those that are near in the image and in depth
-            if abs(columns[k] - column) <= nearby_px and (
-                depth <= 0 or abs(depths[k] - depth) <= tolerance
+            if abs(xy[k, 0] - column) <= nearby_px and (
+                depth <= 0 or abs(z[k] - depth) <= tolerance
             ):
                 for j in range(means.shape[1]):
-                    means[i, j] += sorted_values[k, j]
+                    means[i, j] += values[k, j]
                 count += 1
-        if count:
-            means[i] /= count
-    return means
+        if count > 0:
+            for j in range(means.shape[1]):
+                means[i, j] /= count
 
 
 def nearest_depth(

@@ -503,7 +503,12 @@ def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
 def _triangulate(
     view_a: View, view_b: View, scales: Array, camera: Intrinsics, sigmas: float
 ) -> tuple[Slots, Slots, Array]:
-    """Features of both views that fit one point ``[M]``, ``[M]``, and its depth in `view_a` ``[M]``."""
+    """Features of both views that fit one point, as positions in `free`.
+
+    Returns:
+        For each free feature of `view_b` that of `view_a` whose best match it is, -1 without; for
+        each of `view_a` its best match, and the depth of the point.
+    """
     r, t = _relative_pose(view_a.pose, view_b.pose)
     n = view_a.free.shape[0]
     m = view_b.free.shape[0]
@@ -511,8 +516,11 @@ def _triangulate(
     depth = np.zeros(n)
     best_distance = np.full(n, FAR, np.int64)
     # rays of b's features, (bx, by, 1)
-    bx = (view_b.xy[view_b.free, 0] - camera.cx) / camera.fx
-    by = (view_b.xy[view_b.free, 1] - camera.cy) / camera.fy
+    bx = np.empty(m)
+    by = np.empty(m)
+    for j in range(m):
+        bx[j] = (view_b.xy[view_b.free[j], 0] - camera.cx) / camera.fx
+        by[j] = (view_b.xy[view_b.free[j], 1] - camera.cy) / camera.fy
     cosine_limit = np.cos(MIN_PARALLAX)
     focal = 0.5 * (camera.fx + camera.fy)
     for i in range(n):
@@ -596,8 +604,7 @@ def _triangulate(
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
-    chosen = np.sort(matched_by[matched_by >= 0])
-    return view_a.free[chosen], view_b.free[match[chosen]], depth[chosen]
+    return matched_by, match, depth
 
 
 def triangulate(
@@ -617,14 +624,19 @@ def triangulate(
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    features, other_features, depth = _triangulate(
-        _view(slam_map, slot),
-        _view(slam_map, other),
+    view = _view(slam_map, slot)
+    other_view = _view(slam_map, other)
+    matched_by, match, depth = _triangulate(
+        view,
+        other_view,
         slam_map.scales,
         intrinsics_of(slam_map.camera),
         float(min_parallax_sigmas),
     )
-    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth)
+    chosen = np.sort(matched_by[matched_by >= 0])
+    features = view.free[chosen]
+    other_features = other_view.free[match[chosen]]
+    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth[chosen])
     position = se3.transform(se3.inverse(slam_map.kf_pose[slot]), local)
     return features, other_features, position
 

@@ -85,7 +85,6 @@ def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
     return noise
 
 
-@kernel
 def _rotated(rotation: Array, vector: Array) -> Array:
     """A rotation matrix ``[3, 3]`` rotated further by a rotation vector ``[3]``, and kept orthonormal."""
     pose = np.eye(4)
@@ -405,8 +404,15 @@ def _compensated(
     """Pixels and depths of features that were exposed so many seconds after the middle row, as of that row's time."""
     xy = xy.copy()
     z = z.copy()
-    speed = np.sqrt((angular**2).sum())
-    ax, ay, az = angular / max(speed, 1e-12)
+    # axis and angle per second
+    ax = angular[0]
+    ay = angular[1]
+    az = angular[2]
+    speed = np.sqrt(ax * ax + ay * ay + az * az)
+    length = max(speed, 1e-12)
+    ax /= length
+    ay /= length
+    az /= length
     for i in range(len(xy)):
         # the point before it moved on; without depth it is a direction, which only the rotation changes
         has_depth = z[i] > 0

@@ -94,9 +94,10 @@ def test_perceptual_aliasing(alike, aliased):
     assert (tracking == "ok").all()
     assert is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0) is aliased
     assert not is_aliased(backend.map, observations, {0: here}, everywhere[:4], settings, 0)
-    near = lambda submap, pose: (
-        not are_different_places(here, InitialPose(pose, None, 0, depth=3.0))
-    )  # noqa: E731
+
+    def near(submap, pose):
+        return not are_different_places(here, InitialPose(pose, None, 0, depth=3.0))
+
     assert not is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0, near)
 
 
