@@ -711,7 +711,7 @@ def _run_again(
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
     tuned = [tuner.configuration(candidate.params) for candidate in candidates]
-    default = [] if tuner.shipped is None else [tuner.shipped]
+    default = [] if tuner.default_configuration is None else [tuner.default_configuration]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
         shipped[split] = compare(outcomes, baseline, objective=objective, one_sided=level)

@@ -516,7 +516,7 @@ Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 
 
-def place_of(instance: ProblemInstance) -> ProblemInstance:
+def instance_without_repeat(instance: ProblemInstance) -> ProblemInstance:
     """The instance without its start and seed: all runs there are repeats of each other."""
     return replace(instance, offset=0, seed=0)
 
@@ -548,7 +548,7 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
 
 def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     """Natural logarithms of the errors in metres, by place."""
-    groups = grouped(errors, place_of).items()
+    groups = grouped(errors, instance_without_repeat).items()
     return {
         place: [math.log(max(errors[instance], FLOOR_M)) for instance in group]
         for place, group in groups

@@ -54,9 +54,9 @@ from dynslam_bench.tuning.objectives import (
     Outcomes,
     find_objective,
     hold_last_pose_protocol,
+    instance_without_repeat,
     log_errors,
     outcome,
-    place_of,
     quantity,
     violations,
 )
@@ -192,7 +192,9 @@ class Preview(Record):
 
 
 class Plan:
-    """What follows from a study alone; nothing runs, and nothing is stored.
+    """A study resolved before it runs: trackers, baseline, search space, instances.
+
+    Nothing runs, and nothing is stored.
 
     Args:
         spec: The study.
@@ -204,7 +206,7 @@ class Plan:
     Attributes:
         held: See `held_settings`.
         baseline: What ratios are to.
-        shipped: The tracker's default settings, where the baseline is something else.
+        default_configuration: The tracker's default settings, where the baseline is something else.
         defaults: The settings of trial 0.
         base: The same by dotted name, and the settings of other trackers to choose from.
         trackers: The trackers to choose from, the study's own first.
@@ -239,30 +241,34 @@ class Plan:
         self.held = held_settings(spec)
         self.trackers = _trackers(spec)
         protocol = hold_last_pose_protocol(spec.protocol)
-        around: dict[str, Settings] = {}
+        settings_by_tracker: dict[str, Settings] = {}
         for tracker in self.trackers:
-            described = TRACKERS.get(tracker)
-            protocol.check_scale(tracker, described.sensors)
+            tracker_spec = TRACKERS.get(tracker)
+            protocol.check_scale(tracker, tracker_spec.sensors)
             held = self.configuration({TRACKER: tracker}).settings
-            around[tracker] = apply_overrides(described.settings(), held)
+            settings_by_tracker[tracker] = apply_overrides(tracker_spec.settings(), held)
 
         # the baseline: the study's tracker with a preset or its defaults, or another tracker, which
         # has no settings but those of the fixed ones that it knows
         self.baseline = self.configuration({})
         if spec.baseline and not spec.baseline.endswith(".toml"):
             self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
-        self.shipped = None
+        self.default_configuration = None
         if spec.baseline:
             defaults = fixed if len(self.trackers) == 1 else known_settings(spec.tracker, fixed)
-            self.shipped = Configuration(spec.tracker, defaults)
+            self.default_configuration = Configuration(spec.tracker, defaults)
 
-        # the space around trial 0, which has to lie in it, and the instances
-        self.defaults = around[spec.tracker]
+        # the space around trial 0, and the instances; in `resolved_by_tracker` a source stands for ``auto``
+        self.defaults = settings_by_tracker[spec.tracker]
         sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-        shown = {tracker: _with_source(settings, sequences) for tracker, settings in around.items()}
-        self.search = build_space(spec.space, around, shown)
+        resolved_by_tracker = {
+            tracker: _with_source(settings, sequences)
+            for tracker, settings in settings_by_tracker.items()
+        }
+        self.search = build_space(spec.space, settings_by_tracker, resolved_by_tracker)
         self.space = list(self.search.parameters)
         self.base = self.search.base | flatten(self.defaults)
+        # refuse a study whose trial 0 lies outside its space
         starting_point({}, self.search, what="the baseline")
         self.design = design_of(spec)
 
@@ -510,7 +516,7 @@ def running_order(instances: Sequence[ProblemInstance], seed: int) -> list[Probl
 def with_more_starts(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
     more = list(instances)
-    for repeats in grouped(instances, place_of).values():
+    for repeats in grouped(instances, instance_without_repeat).values():
         used = {instance.offset for instance in repeats}
         unused = (offset for offset in itertools.count() if offset not in used)
         added = islice(unused, max(FEWEST_STARTS - len(used), 0))
@@ -629,7 +635,7 @@ def _check_repeats(
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
         same_frames = (here.start, here.stop) == (there.start, there.stop)
-        repeats = place_of(one) == place_of(other) or same_frames
+        repeats = instance_without_repeat(one) == instance_without_repeat(other) or same_frames
         if shared > 0 and not (repeats and (one in apart) == (other in apart)):
             raise StudyError(
                 f"'{one}' and '{other}' share {shared} frames",

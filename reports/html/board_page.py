@@ -15,12 +15,12 @@ from dynslam_bench.reports.model.answers import error_columns
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
-    Cell,
+    TrackerOnSequence,
     compare_pairs,
     more_sequences,
 )
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import Interval, Scope, Standing, Verdict
+from dynslam_bench.reports.model.statistics import Interval, RankingVerdict, Scope, Standing
 from dynslam_bench.reports.tables.leaderboard import (
     error_cell,
     frame_time_cell,
@@ -32,7 +32,7 @@ from dynslam_bench.reports.tables.leaderboard import (
 )
 from dynslam_bench.reports.tables.table import TableCell
 
-_OPPOSITE: dict[Verdict, str] = {
+_OPPOSITE: dict[RankingVerdict, str] = {
     "better": "worse",
     "better, but lost": "worse, but lost fewer",
     "worse": "better",
@@ -392,7 +392,7 @@ def ratio_numbers(ratio: Interval) -> list[float | None]:
 
 
 def cell_data(
-    cell: Cell,
+    cell: TrackerOnSequence,
     tracker: int,
     sequence: int,
     metrics: Sequence[Mapping[str, str]],

@@ -28,15 +28,15 @@ from dynslam_bench.reports.model.names import (
     name_columns,
     shortened,
 )
-from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
+from dynslam_bench.reports.model.row import RunRow, command_with, grouped, sequence_options
 from dynslam_bench.reports.model.statistics import (
     FAMILY_ERROR,
     FEWEST,
     Interval,
+    RankingVerdict,
     Scope,
     Sequences,
     Standing,
-    Verdict,
     log_medians,
     ratio_interval,
     resolution,
@@ -54,7 +54,7 @@ STATIC_CAMERA = "static camera (from ground truth)"
 """What captions call the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
 """Tracker that errors are divided by where no other is asked for."""
-On = Literal["common", "all"]
+RankingBasis = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
 OVERALL = "overall"
 """The category of all sequences."""
@@ -96,7 +96,7 @@ class Board:
         rows: All rows.
         on: What trackers are ranked on.
         rank_seen: Whether cells rank whose masks come from a network that was trained on the scene.
-        columns: Column id of a row to the name of its sequence.
+        sequence_names: Sequence key of a row (`RunRow.sequence_key`) to the name of its sequence.
         trackers: Variant keys in order of standing; those of which only final trajectories are
             known stand apart.
         final_only: Variant keys of imports and batch programs of which only the final trajectory is
@@ -121,16 +121,16 @@ class Board:
         standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking, from the best to the worst.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
-        no_better: Variant keys of trackers that are not ranked since they are no better than a
+        ranked_out_by_static: Variant keys of trackers that are not ranked since they are no better than a
             static camera: the geometric mean of their errors over its on the common sequences is 1
             or more.
         never_succeeded: Variant keys that never succeeded on the common sequences.
     """
 
     rows: list[RunRow]
-    on: On = "common"
+    on: RankingBasis = "common"
     rank_seen: bool = False
-    columns: dict[str, str] = field(default_factory=dict)
+    sequence_names: dict[str, str] = field(default_factory=dict)
     trackers: list[str] = field(default_factory=list)
     final_only: list[str] = field(default_factory=list)
     labels: dict[str, str] = field(default_factory=dict)
@@ -143,7 +143,7 @@ class Board:
     families: dict[str, str] = field(default_factory=dict)
     category: str = OVERALL
     unscored: list[str] = field(default_factory=list)
-    cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
+    cells: dict[str, dict[str, TrackerOnSequence]] = field(default_factory=dict)
     static_camera: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
     reference_name: str = STATIC_CAMERA
@@ -151,7 +151,7 @@ class Board:
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
-    no_better: list[str] = field(default_factory=list)
+    ranked_out_by_static: list[str] = field(default_factory=list)
     never_succeeded: list[str] = field(default_factory=list)
 
     @cached_property
@@ -217,7 +217,7 @@ class Board:
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
-        return self.columns[row.column_id]
+        return self.sequence_names[row.sequence_key]
 
     def runs(self, key: str) -> list[RunRow]:
         """All rows of a tracker."""
@@ -236,7 +236,7 @@ class Board:
         """Why a tracker is not ranked, in a few words; empty for one that is, and where nothing is known of it."""
         if key in self.ranked:
             return ""
-        if key in self.no_better:
+        if key in self.ranked_out_by_static:
             return "no better than a static camera"
         if key in self.never_succeeded:
             return "nothing succeeded"
@@ -290,7 +290,7 @@ class Board:
 
     @property
     def typical(self) -> set[str]:
-        """Ids of the runs that stand for the cells with a success and ground truth, see `Cell.typical`."""
+        """Ids of the runs that stand for the cells with a success and ground truth, see `TrackerOnSequence.typical`."""
         cells = (cell for key in self.trackers for cell in self.cells[key].values())
         return {cell.typical.run_id for cell in cells if cell.succeeded}
 
@@ -341,6 +341,7 @@ class Board:
                 "settings": "; ".join(assignments(row.variant)),
                 "provenance": row.tracker.provenance,
                 "sequence": self.sequence(row),
+                "column_id": row.sequence_key,
                 "frames": part_words(row),
                 "split": row.sequence.split,
                 "study": row.trial_of,
@@ -380,7 +381,7 @@ class Board:
 def make_board(
     rows: Sequence[RunRow],
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     *,
     rank_seen: bool = False,
 ) -> Board:
@@ -425,16 +426,16 @@ def category_boards(board: Board) -> dict[str, Board]:
         rows = [row for row in board.rows if board.sequence(row) in names]
         keys = {row.variant_key for row in rows}
         labels = {key: label for key, label in board.labels.items() if key in keys}
-        part = Board(
+        category_board = Board(
             rows,
             board.on,
             board.rank_seen,
-            board.columns,
+            board.sequence_names,
             labels=labels,
             category=category,
             asked_reference=board.asked_reference,
         )
-        boards[category] = _fill_board(part)
+        boards[category] = _fill_board(category_board)
     return boards
 
 
@@ -634,7 +635,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     return further if further <= MOST_FURTHER else None
 
 
-class Pair(NamedTuple):
+class TrackerPair(NamedTuple):
     """Two trackers on the common sequences that both have.
 
     Attributes:
@@ -655,11 +656,11 @@ class Pair(NamedTuple):
     sequences: int
     lost: tuple[int, int]
     p_value: float | None
-    verdict: Verdict
+    verdict: RankingVerdict
     scope: Scope
 
 
-def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
+def compare_pairs(board: Board, keys: Sequence[str]) -> list[TrackerPair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs = common_logs(board, keys)
     succeeded = {key: without_lost(board, logs[key], board.lost(key)) for key in keys}
@@ -686,12 +687,12 @@ def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
             len(both_ran & board.lost(other) - board.lost(one)),
         )
         order = tests.get((one, other))
-        verdict: Verdict = "" if order is None else "cannot tell"
+        verdict: RankingVerdict = "" if order is None else "cannot tell"
         if order is not None and order.first_by:
             verdict = "better" if order.first_by < 0 else "worse"
         p_value = None if order is None else order.p_value
         scope: Scope = "" if order is None else order.scope
-        pairs.append(Pair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
+        pairs.append(TrackerPair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
     return pairs
 
 
@@ -839,7 +840,7 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
         if not any(cells[name].success for name in considered):
             board.never_succeeded.append(key)
         elif key in competing and board.static_ratio(key) >= 1 - 1e-9:
-            board.no_better.append(key)
+            board.ranked_out_by_static.append(key)
         elif key in competing:
             board.ranked.append(key)
 
@@ -862,7 +863,7 @@ def _most_cells(sequences: Sequence[set[str]]) -> int:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TrackerOnSequence:
     """All runs of one tracker on one sequence.
 
     Attributes:
@@ -928,7 +929,7 @@ class Cell:
         return endings[0] if endings else ""
 
 
-def make_cell(rows: Sequence[RunRow]) -> Cell:
+def make_cell(rows: Sequence[RunRow]) -> TrackerOnSequence:
     """Order the runs of a cell and find the copies among them: other seeds with equal results."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
     by_input = grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported))
@@ -936,7 +937,7 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
     for of_seeds in by_input.values():
         n_results = len({_result_of(row) for row in of_seeds})
         kept += of_seeds[:1] if n_results == 1 else of_seeds
-    return Cell(tuple(ordered), tuple(kept))
+    return TrackerOnSequence(tuple(ordered), tuple(kept))
 
 
 def _result_of(row: RunRow) -> tuple[object, ...]:
@@ -1034,7 +1035,7 @@ def missing_commands(board: Board) -> list[str]:
 
         # one command for all sequences of which the same part is run
         missing = [by_sequence[name][0] for name in names]
-        for part, rows in grouped(missing, lambda row: tuple(part_options(row))).items():
+        for part, rows in grouped(missing, lambda row: tuple(sequence_options(row))).items():
             places = [row.place or row.sequence.id for row in rows]
             commands.append(command_with(tracker, [*places, *part, *repeats]))
     return commands
@@ -1123,7 +1124,7 @@ def load_board(
     protocol: Protocol | str = "tum-rgbd/v1",
     *,
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     rank_seen: bool = False,
     trials: bool = False,
 ) -> Board:

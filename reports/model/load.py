@@ -58,7 +58,7 @@ def _score_run(store: RunStore, protocol: Protocol, run_id: str) -> tuple[RunRow
         record, state = store.read_with_state(run_id)
         return make_row(store, record, protocol), state
     except DynslamError as error:
-        return f"{store.place(run_id)}: {error}"
+        return f"{store.shown_folder(run_id)}: {error}"
 
 
 def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow, str]]) -> None:
@@ -76,7 +76,7 @@ def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow,
 
 
 @dataclass
-class Loaded:
+class LoadedRuns:
     """Everything read from the stores.
 
     Attributes:
@@ -116,7 +116,7 @@ def load_for_report(
     pool: WorkerPool | None = None,
     *,
     trials: bool = False,
-) -> tuple[Loaded, Protocol]:
+) -> tuple[LoadedRuns, Protocol]:
     """Read all runs for a report in which nobody is left out.
 
     Where all runs have final trajectories only, the protocol's variant for those takes its place.
@@ -175,7 +175,7 @@ def load_runs(
     pool: WorkerPool | None = None,
     *,
     trials: bool = False,
-) -> Loaded:
+) -> LoadedRuns:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
     Args:
@@ -190,7 +190,7 @@ def load_runs(
     """
     # read every store: unchanged rows from its index, the others from the runs' files
     on_progress(0, None, "looking for what has changed")
-    loaded = Loaded()
+    loaded = LoadedRuns()
     everything = []
     for store in stores:
         run_ids = store.ids()

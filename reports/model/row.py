@@ -127,7 +127,7 @@ class RunRow(RunRecord):
         return self.tracker.ranked and self.start_map is None
 
     @property
-    def column_id(self) -> str:
+    def sequence_key(self) -> str:
         """Content, camera, frames and stride: one column of a table; equal for all repeats and spellings."""
         return self.sequence.block or self.sequence.part
 
@@ -168,7 +168,10 @@ class RunRow(RunRecord):
 
     @property
     def variant_key(self) -> str:
-        """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat."""
+        """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat.
+
+        It is final only after `programs.choose_runs`, which sets `split_by`.
+        """
         if not self.split_by:
             return self.settings_key
         return f"{self.settings_key}|{json.dumps(self.split_by, sort_keys=True)}"
@@ -456,7 +459,7 @@ def run_command(row: RunRow) -> str:
     """The command that makes a run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    words = [row.place or row.sequence.id, *part_options(row)]
+    words = [row.place or row.sequence.id, *sequence_options(row)]
     if row.seed:
         words += ["--seed", str(row.seed)]
     if row.offset:
@@ -484,7 +487,7 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
     return shlex.join(["dynslam-bench", "run", tracker, *words, *settings])
 
 
-def part_options(row: RunRow) -> list[str]:
+def sequence_options(row: RunRow) -> list[str]:
     """Its part of the sequence, and the camera that its command named, as options of the command line."""
     words = []
     if row.frames is not None:

@@ -208,7 +208,9 @@ def test_quitting_never_pays(reward: str) -> None:
     short, infos, ends = play(
         SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward, lost_after=3)
     )
+    # frames 1 to 3, then 3 lost ones
     assert len(short) == 6
+    # terminated, truncated
     assert ends[-1] == (True, False)
     assert sum(short) == pytest.approx(sum(whole), abs=1e-12)
     assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(4 / 20)

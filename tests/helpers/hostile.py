@@ -146,13 +146,6 @@ def alive(pids: list[int]) -> list[int]:
     return running
 
 
-def until(condition, seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds} s"
-        time.sleep(0.05)
-
-
 HOG = "import time; hoard = [b'x' * 2**24 for _ in range(100)]; time.sleep(300)"
 
 
