@@ -3,7 +3,7 @@
 import re
 import shlex
 import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -125,8 +125,6 @@ class ReportPaths:
     trials: int = 0
 
 
-_NOT_IN_LATEX = ("machines", "failures")
-"""Ids of tables that no paper would show."""
 Fact = tuple[str, str, list[str]]
 """A number, what it counts, and its details."""
 
@@ -415,13 +413,11 @@ def _write(content: _Content, output: Path) -> ReportPaths:
     for name, table in tables_by_id.items():
         write_atomic(paths.csv[name], csv_text(table.frame()))
     write_atomic(paths.csv["runs"], csv_text(content.board.frame()))
-    write_atomic(paths.markdown, _markdown(content, tables_by_id.values(), facts, footer))
-    latex_tables = [
-        to_latex(table, content.protocol.id)
-        for name, table in tables_by_id.items()
-        if name not in _NOT_IN_LATEX
-    ]
-    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex_tables))
+    write_atomic(paths.markdown, _markdown(content, tables_by_id, facts, footer))
+    few = _paper_tables(tables_by_id, content.protocol)
+    latex_tables = [to_latex(table, content.protocol.id) for table in few]
+    head = "% needs \\usepackage{booktabs}; all other tables: csv/\n"
+    write_atomic(paths.latex, head + "\n".join(latex_tables))
     ReportData(
         title=content.title,
         protocol=content.protocol.describe(),
@@ -451,8 +447,19 @@ def _write(content: _Content, output: Path) -> ReportPaths:
     return paths
 
 
-def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], footer: str) -> str:
-    """Headline, facts, notes and tables as Markdown."""
+def _paper_tables(tables_by_id: Mapping[str, Table], protocol: Protocol) -> list[Table]:
+    """The few tables that a paper shows: the board, errors by sequence and category, the first relative error."""
+    names = ["leaderboard", "per_sequence", "categories"]
+    names += [f"rpe_{spec.key}_trans" for spec in protocol.rpe[:1]]
+    return [table for name, table in tables_by_id.items() if name in names]
+
+
+def _markdown(
+    content: _Content, tables_by_id: Mapping[str, Table], facts: Sequence[Fact], footer: str
+) -> str:
+    """Headline, facts, notes and the few tables of a paper as Markdown, with the failures."""
+    shown = _paper_tables(tables_by_id, content.protocol)
+    shown += [table for name, table in tables_by_id.items() if name == "failures"]
     board = content.board
     counts = ", ".join(f"{value} {name}" for value, name, _ in facts)
     notes = [how_to_read(board), *content.notes[OVERALL], *content.common_notes]
@@ -462,7 +469,12 @@ def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], 
     opening = "\n\n".join(prose(sentence) for sentence in said)
     head = f"# {prose(content.title)}\n\n{opening}\n\n{content.protocol.describe()}\n\n{counts}\n\n"
     quoted = "".join(f"> {prose(note)}\n\n" for note in notes)
-    return head + quoted + "\n".join(map(to_markdown, shown)) + f"\n{footer}\n"
+    return (
+        head
+        + quoted
+        + "\n".join(map(to_markdown, shown))
+        + f"\nAll other tables: csv/.\n\n{footer}\n"
+    )
 
 
 def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:

@@ -371,7 +371,8 @@ def make_and_show(
     rows = show_runs((run.record for run in made), store, protocol, watched.reused)
     missing_files = show_files(rows, store, pictures)
     show_cautions(rows, watched)
-    note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
+    counted = f"{len(rows)} run{'s' if len(rows) != 1 else ''}"
+    note(f"{counted} in {store.root}; report them with: dynslam-bench report {results}")
 
     # what scripts see: the exit code
     not_ok = any(row["status"] != "ok" for row in rows)
@@ -453,31 +454,38 @@ class WatchedRuns:
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
-        # finished runs, and of running ones the share of their frames that is done
-        self._done = 0.0
-        self._shares: dict[str, float] = {}
+        # frames of all runs that are made, of those that have ended, and of running ones
+        self._planned = runs.Plan()
+        self._done = 0
+        self._running: dict[str, int] = {}
+        self._ended_runs = 0
 
     def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
-        with progress("runs") as self._advance:
+        with progress("frames") as self._advance:
             self._advance(0, None, "opening sequences")
             return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
 
     def _plan(self, plan: runs.Plan) -> None:
+        self._planned = plan
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
     def _event(self, event: runs.RunEvent) -> None:
-        """Count a run that has ended as 1, one that goes on as the share of its frames."""
-        # the share that this run has added to the bar so far
-        before = self._shares.pop(event.run_id, 0.0)
+        """Count the frames that are tracked, of all that the runs have."""
         if event.record is not None:
-            self._done += 1.0 - before
+            self._running.pop(event.run_id, None)
+            if event.kind == "finished":
+                self._done += event.record.n_frames
+                self._ended_runs += 1
             self._ended(event, event.record)
         elif event.partial is not None:
-            share = event.partial["frames_done"] / max(event.partial["frames"], 1)
-            self._shares[event.run_id] = share
-            self._done += share - before
-        self._advance(self._done, event.total, event_text(event))
+            self._running[event.run_id] = event.partial["frames_done"]
+
+        step = event_text(event)
+        if self._planned.runs > 1:
+            step = f"run {min(self._ended_runs + 1, self._planned.runs)} of {self._planned.runs}, {step}"
+        done = self._done + sum(self._running.values())
+        self._advance(done, self._planned.frames.total() or None, step)
 
     def _ended(self, event: runs.RunEvent, record: runs.RunRecord) -> None:
         """Remember what a run was asked to open and whether it was stored, and write a line on it."""
@@ -487,7 +495,9 @@ class WatchedRuns:
         if event.kind == "reused":
             self.reused.add(record.run_id)
             line += " (stored)"
-        note(line)
+        # a single run is shown in full when it has ended
+        if event.total > 1:
+            note(line)
 
     def _fault(self, _: runs.RunSpec, error: DynslamError) -> None:
         if str(error) not in self.faults:
@@ -496,8 +506,11 @@ class WatchedRuns:
 
 
 def event_text(event: runs.RunEvent) -> str:
-    """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
+    """Tracker and sequence of a run and what it does, for a progress bar."""
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
+    if event.kind == "started":
+        # nothing is heard of a run before its first frames
+        return f"{text}, starting: a first run compiles its code"
     if event.kind != "progress" or event.partial is None:
         return text
     done = event.partial["frames_done"]

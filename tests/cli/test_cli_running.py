@@ -567,7 +567,7 @@ def test_a_faulty_tracker_fails_with_4(facts, tmp_path):
 
 
 ROWS = [
-    ["run", "tracker", "sequence", "ATE (m)", "masks"],
+    ["run", "tracker", "sequence", "ATE (mm)", "masks"],
     [
         "0123456789abcdef",
         "emfoa-oft",
@@ -675,8 +675,8 @@ def test_no_motion_of_a_fixed_camera_is_shown_and_nothing_is_worse_than_it(capsy
         runs.show_rows([row], None, "p")
         out = capsys.readouterr().out.splitlines()
         assert len(out) == 2
-        assert "ATE (m)" in out[0]
-        assert "false motion (m)" in out[0]
+        assert "ATE (mm)" in out[0]
+        assert "false motion (mm)" in out[0]
         assert "from the store" not in out[0]
 
 
