@@ -27,7 +27,9 @@ def test_an_image_of_vga_s_width_stays_as_it_is(shape):
     assert in_given_image(keypoints, gray) is keypoints
 
 
-@pytest.mark.parametrize("shape", [(240, 320), (120, 160), (270, 480), (241, 427), (320, 240), (1, 7)])
+@pytest.mark.parametrize(
+    "shape", [(240, 320), (120, 160), (270, 480), (241, 427), (320, 240), (1, 7)]
+)
 def test_the_image_and_its_mask_are_enlarged_alike(shape):
     gray = np.zeros(shape, np.uint8)
     gray[:, : shape[1] // 2] = 255
