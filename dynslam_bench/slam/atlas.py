@@ -199,12 +199,13 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
         SettingsError: The file cannot be read, is no map, or one of another camera, features or
             sensor.
     """
+    scales = features.scales(camera.width)
     if not file:
-        return Atlas(Map(camera, features.scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
+        return Atlas(Map(camera, scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
     path = Path(file).expanduser()
     saved = read_map(path)
     saved.check(camera, features, "rgbd" if depth else "rgb", str(path))
-    return unpacked(saved, camera, features.scales)
+    return unpacked(saved, camera, scales)
 
 
 def save_atlas(
@@ -280,7 +281,7 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     Args:
         saved: What was read; it has to fit the camera and the features.
         camera: Undistorted intrinsics.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
     """
     arrays = saved.arrays
     header = saved.header

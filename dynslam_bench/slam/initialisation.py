@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.features.matching import rotation_consistent, search_in_radius
-from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.geometry import Camera, feature_scale, se3
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
@@ -522,7 +522,10 @@ class TwoViewInitialiser:
         matches = np.zeros((0, 2), np.int64)
         if first is not None:
             matches = match_views(
-                first.observations, observations, self._expected, settings.radius_px
+                first.observations,
+                observations,
+                self._expected,
+                settings.radius_px * feature_scale(camera.width),
             )
         view = View(frame, observations, matches)
 

@@ -23,7 +23,6 @@ from dynslam_bench.features.matching import (
     search_in_radius,
 )
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import STATED_WIDTH
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
@@ -72,8 +71,6 @@ MIN_CLOSE = 100
 """Fewer tracked close points than this are few (ORB-SLAM2)."""
 NEW_CLOSE = 70
 """More close features than this that are not in the map are many: where few are tracked, they make a keyframe."""
-NEW_SHARE = 0.5
-"""More than this share of the close features are many, too, in images below VGA's width, which have few in all."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
@@ -425,10 +422,7 @@ class KeyframePolicy:
 
         # many close features are not in the map, and few are tracked or the last keyframe is long ago
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
-        enough_new: float = NEW_CLOSE
-        if slam_map.camera.width < STATED_WIDTH:
-            enough_new = min(NEW_CLOSE, NEW_SHARE * np.count_nonzero(close))
-        many_new = np.count_nonzero(close & ~matched) > enough_new
+        many_new = np.count_nonzero(close & ~matched) > NEW_CLOSE
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if many_new and (few_close or frame - self._last >= settings.max_gap):
             return True

@@ -151,7 +151,7 @@ class Map:
 
     Args:
         camera: Intrinsics without distortion.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
 
     Attributes:
         kf_alive: bool ``[S]``, whether the slot is in use.
@@ -423,8 +423,9 @@ class Map:
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
         views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
+        to_octave_0 = self.scales / self.scales[0]
         _refresh(
-            points, self._point_views, self.descriptor, self._observation_tables, views, self.scales
+            points, self._point_views, self.descriptor, self._observation_tables, views, to_octave_0
         )
 
     def release(self) -> None:

@@ -22,7 +22,7 @@ from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core import DynslamError, RunError, SettingsError, TrackerError, write_atomic
 from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.geometry import Camera, format_ns, ns_of, se3
+from dynslam_bench.geometry import Camera, feature_scale, format_ns, ns_of, se3
 
 MAP_FILE = "map.npz"
 """Name of a run's saved map."""
@@ -114,10 +114,9 @@ class MapFeatures(Record):
     levels: int = Field(ge=1, le=64)
     scale_factor: float = Field(ge=1, le=100)
 
-    @property
-    def scales(self) -> NDArray[np.float64]:
-        """Scale of each level."""
-        return np.asarray(self.scale_factor ** np.arange(self.levels, dtype=np.float64))
+    def scales(self, width: int) -> NDArray[np.float64]:
+        """Pixels of an image of a width in a pixel of each level, ``[levels]``."""
+        return feature_scale(width) * self.scale_factor ** np.arange(self.levels, dtype=np.float64)
 
 
 class MapHeader(Record):

@@ -38,6 +38,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.features.enlarging import enlarged, enlarged_mask, in_given_image
 from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -257,14 +258,18 @@ class SlamPipeline:
         """Keypoints, and their undistorted pixels ``[N, 2]``."""
         extractor = self._extractor
         with clock("features"):
+            # a narrow image is enlarged
+            image = enlarged(gray)
             if (
                 mask is not None
                 and self._segmentation is not None
                 and isinstance(extractor, MaskedExtractor)
             ):
-                keypoints = extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+                share = self._segmentation.outside_share
+                keypoints = extractor.extract_masked(image, enlarged_mask(mask), share)
             else:
-                keypoints = extractor.extract(gray)
+                keypoints = extractor.extract(image)
+            keypoints = in_given_image(keypoints, gray)
             xy = self._camera.undistort_points(keypoints.xy)
         return keypoints, xy
 
