@@ -12,8 +12,6 @@ import gymnasium as gym
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.episode import AccuracyMinusCost
-from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
 
 Split = Literal["train", "test", "recordings"]
 
@@ -68,6 +66,9 @@ class ControlBenchmark:
             DynslamError: As `SlamEnv`; a recording that is not there names the command that fetches
                 it.
         """
+        from dynslam_bench.envs.slam_env import SlamEnv
+        from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
+
         splits = {"train": self.train, "test": self.test, "recordings": self.recordings}
         if split not in splits:
             raise SettingsError(

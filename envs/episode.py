@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Trajectory
 from dynslam_bench.core import EvaluationError, SettingsError
 from dynslam_bench.core.arguments import names_wrong_arguments
-from dynslam_bench.evaluation import OnlineSample, Protocol, evaluate
 from dynslam_bench.geometry import se3
+
+if TYPE_CHECKING:
+    from dynslam_bench.evaluation import OnlineSample, Protocol
 
 FrameState = Literal["initialising", "ok", "lost", "dropped"]
 
@@ -141,6 +143,8 @@ def _flagged(given: Mapping[str, Any], missing: Mapping[str, Any]) -> dict[str, 
 @cache
 def metric_names(protocol: Protocol) -> tuple[str, ...]:
     """The metrics that an episode may have: those of a long path and of a camera that stands still."""
+    from dynslam_bench.evaluation import evaluate
+
     # twists [2000, 6] of a long path at 30 Hz: translations along a helix, and turns
     stamps = np.arange(2000) / 30.0
     helix = np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0

@@ -313,7 +313,7 @@ def _numbers(text: str, whole: str) -> list[int]:
 
 def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     """``blur:0.5,glare:0.2`` as kinds and strengths in alphabetical order; an empty text holds none."""
-    from dynslam_bench.envs import Degradation
+    from dynslam_bench.envs.wrappers import Degradation
 
     kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
     strengths = {

@@ -187,7 +187,7 @@ def culling_effect(rows: Iterable[RunRow]) -> list[str]:
 
 def compile_kernels(tracker: str = COMPILED) -> None:
     """Use all kernels of rendering and a tracker once: then they lie compiled in the user's cache."""
-    from dynslam_bench.envs import SlamEnv
+    from dynslam_bench.envs.slam_env import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.testing import CornerSequence
 

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import entry_points
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
@@ -263,6 +262,8 @@ def _entry_points(*_path: str) -> Any:
     Args:
         *_path: The import path, so that another one is read again.
     """
+    from importlib.metadata import entry_points
+
     return entry_points()
 
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
 from dynslam_bench.core import RunError, TrackerError, read_npz, translate_errors
-from dynslam_bench.envs import FrameOutcome, SlamEnv
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
+from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Trajectory, se3

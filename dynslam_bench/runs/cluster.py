@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from dynslam_bench.core import RunError, find_data_root, translate_errors
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.envs import resolve_device
+from dynslam_bench.envs.slam_env import resolve_device
 from dynslam_bench.runs.own_code import package_code
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of

@@ -25,7 +25,7 @@ from dynslam_bench.runs.store import RunStore
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dynslam_bench.envs import FrameOutcome
+    from dynslam_bench.envs.episode import FrameOutcome
 
 FRAMES_FILE = "frames.jsonl"
 """The child's log: one line a frame, complete before the next frame begins; gone when the run is stored."""

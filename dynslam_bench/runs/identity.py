@@ -32,8 +32,8 @@ from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import BaseFolders, ImportPath
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
-from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.own_code import (

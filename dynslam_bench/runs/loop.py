@@ -11,7 +11,8 @@ import numpy as np
 
 from dynslam_bench.contracts import MapOutputs
 from dynslam_bench.core import call_periodically
-from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
 from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
 from dynslam_bench.geometry import Trajectory, write_tum
