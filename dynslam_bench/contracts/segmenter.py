@@ -94,7 +94,7 @@ class SegmenterSpec:
         entry_point: ``"module:factory"``, called as ``factory(settings, context)`` with
             `SegmentationSettings` and `SegmenterContext`; returns a `Segmenter`.
         summary: One line.
-        license: Of code and weights, SPDX id or remark.
+        license: License of code and weights: an SPDX id or a remark.
         citation: What to cite.
     """
 

@@ -65,7 +65,7 @@ class ModuleCode:
     """What is known of one module's source.
 
     Attributes:
-        digest: Of its syntax, see `syntax_digest`.
+        digest: Digest of the source's syntax, see `syntax_digest`.
         imports: What it imports from this package.
         names: What each name stands for that it imports at its top level, by the name that it has
             in this module.

@@ -324,8 +324,8 @@ def build_plugin(
         call: Calls the factory that it is given.
 
     Raises:
-        DynslamError: Of the type `fault` where the factory fails or gives something else; its own
-            pass unchanged.
+        DynslamError: Raised as `fault` where the factory fails or gives something else. A
+            `DynslamError` of the factory passes unchanged.
     """
     # what the factory raises names the plug-in
     factory = load_object(spec.entry_point)

@@ -73,7 +73,8 @@ class Reads(Record):
         modules: Where each module that was asked for was found, by its top-level name.
         distributions: Version and digest of the RECORD of each distribution whose modules were
             imported.
-        programs: The same of each file and folder that the processes of programs were made of.
+        programs: Digest of each file and folder that the processes of external programs were made
+            of: executables, libraries, and what their command lines name.
     """
 
     files: Entries = Field(default_factory=dict)

@@ -51,7 +51,8 @@ def fundamental_matrix(
 
     Args:
         x1: Undistorted pixels of the previous image, float64 ``[N, 2]``.
-        x2: Those of the current one that they are matched with, float64 ``[N, 2]``.
+        x2: Undistorted pixels of the current image, float64 ``[N, 2]``; row i is matched with row i
+            of `x1`.
         inlier_px: Distance in pixels up to which a match agrees with F.
         max_draws: Most samples that RANSAC draws.
         min_matches: Fewer matches give no F.

@@ -52,7 +52,7 @@ class Evaluation(Record):
     """The errors of one trajectory, with the protocol that they hold under.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.
         protocol: Its one-line description.
@@ -184,7 +184,8 @@ def evaluate_files(
 
     Raises:
         TrajectoryError: A file cannot be read.
-        EvaluationError: As `evaluate`.
+        EvaluationError: Fewer than two poses have ground truth, or the policy for lost frames needs
+            the input frames, see `evaluate`.
     """
     return evaluate_loaded(
         load_trajectory(estimate, timestamps), load_trajectory(ground_truth, timestamps), protocol
@@ -199,7 +200,8 @@ def evaluate_loaded(
     Under evo's association all lines with the same stamp take part, else the last of them.
 
     Raises:
-        EvaluationError: As `evaluate`.
+        EvaluationError: Fewer than two poses have ground truth, or the policy for lost frames needs
+            the input frames, see `evaluate`.
     """
     protocol = get_protocol(protocol)
     repeats = not protocol.one_to_one

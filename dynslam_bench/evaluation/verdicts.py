@@ -48,7 +48,7 @@ _TIE = 1e-12
 _MANY_TIES = math.sqrt(0.5)
 """Share of ties above which the pseudo-median is one: its square is the share of pairs of ties."""
 _WILCOXON_EFFICIENCY = 3.0 / math.pi
-"""Of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes (Pitman)."""
+"""Pitman's efficiency of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes."""
 _MOST_SCENES = 100_000
 
 
@@ -82,7 +82,7 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> Typical:
 
     Args:
         log_ratios: One a scene, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
 
@@ -126,7 +126,7 @@ def excluding_interval(log_ratios: ArrayLike, confidence: float = 0.90) -> Typic
 
     Args:
         log_ratios: One a scene ``[S]``, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
     others = values[np.abs(values) > _TIE]
@@ -398,7 +398,7 @@ def findings(
     Args:
         comparison: The candidate beside the baseline.
         subject: What to call the candidate, e.g. ``trial 7``.
-        margin: As `verdict_of` takes it.
+        margin: Differences below this share do not matter.
     """
     verdict = verdict_of(comparison, margin)
     sentences = [_claim(comparison, verdict, subject)]

@@ -179,7 +179,7 @@ def search_labels(
         matching: Points, target and tables of the matching cost.
         neighbours: int64 ``[N, K]`` of `nearest`.
         guess: float32 ``[N, 2]``, predicted positions; not finite means none.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
 
     Returns:
         The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
@@ -329,7 +329,7 @@ def run_phase(
             finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
         rules: `SearchRules`.
     """
     population = state.costs.shape[1]
@@ -725,7 +725,7 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
         points: float32 ``[N, 2]``.
         labels: float32 ``[N, 4]``.
         costs: int64 ``[N]``; pairs are drawn from the better half.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
 
     Returns:
         float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.

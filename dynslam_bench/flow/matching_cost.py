@@ -91,7 +91,7 @@ class MatchingCost(NamedTuple):
     Attributes:
         reference: The points.
         target: The image that they are searched in.
-        tables: Of the image size and the weights.
+        tables: Cost tables for the image size and the weights of Eq. 1, see `cost_tables`.
     """
 
     reference: Reference

@@ -366,7 +366,8 @@ def blur_cascade(
         top: First row of the stripe.
         bottom: One past its last row.
         blurs: int64 ``[L, 2]``, taps and distance of each level.
-        reach: Of `level_reach`.
+        reach: int64 ``[L + 1]`` of `level_reach`: rows beyond the stripe that each level must
+            compute.
         first_level: Number of the first of these levels.
         geometry: `layout.MapGeometry`.
         margin: Empty histograms around the maps.

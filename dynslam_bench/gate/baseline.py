@@ -67,7 +67,7 @@ def measurement_of(
 
     Args:
         case: Name of what was run.
-        number: Of the round.
+        number: Number of the round, from 0.
         record: The run.
         store: Where it is stored.
         protocol: How it is scored.
@@ -179,7 +179,7 @@ class Baseline(Record):
     """The baseline file.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         question: Digest of the question that it was recorded for.
         asked: That question, so that a change of it can be named.
         protocol: Id of the protocol of the errors.
@@ -188,7 +188,7 @@ class Baseline(Record):
         origin: Which program was measured.
         recorded: When, UTC, ISO 8601.
         machine: The computer.
-        versions: Of Python and the packages that matter.
+        versions: Versions of Python and the packages that matter.
         runs: The development set.
         confirmation: The confirmation set; empty without one.
         looks: What became known of the confirmation set: one line for each look at it.

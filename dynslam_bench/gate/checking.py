@@ -190,7 +190,7 @@ def _in_turns(
 
     Args:
         baseline: One side.
-        candidate: The other one.
+        candidate: The candidate's side.
         cases: What a round runs.
         gate: The question.
         on_run: Told of every run.

@@ -45,7 +45,7 @@ class Findings(NamedTuple):
         level: Two-sided level of the interval.
         lost: Runs that the candidate lost, and the baseline.
         cases: Every sequence.
-        guardrails: Those that were asked for.
+        guardrails: Every guardrail that the gate's file names.
         exit_code: See `GateResult`.
     """
 

@@ -27,7 +27,7 @@ class CaseResult(Record):
     Attributes:
         case: Its name.
         baseline_m: Median error of the baseline's rounds in metres; None where all were lost.
-        candidate_m: That of the candidate.
+        candidate_m: Median error of the candidate's rounds in metres; None where all were lost.
         ratio: The candidate's typical error over the baseline's, lost runs counted as three times;
             None where both lost all.
         lost_baseline: Rounds that the baseline lost.
@@ -68,7 +68,7 @@ class GateResult(Record):
     """What a gate found.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         verdict: On the error.
         exit_code: 0 passed, 3 runs failed, 4 regressed or a guardrail is broken, 5 undecided.
         sentence: The verdict in words.

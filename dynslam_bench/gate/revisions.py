@@ -96,7 +96,7 @@ def checked_out(folder: Path, revision: str) -> Iterator[Path]:
         revision: The commit.
 
     Yields:
-        The same folder in the checkout.
+        The counterpart of `folder` in the checkout.
 
     Raises:
         RunError: Git cannot check it out, or the revision lacks the folder.

@@ -116,7 +116,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
     Raises:
-        TrajectoryError: As `load_tum`.
+        TrajectoryError: The file is missing or damaged, or holds no valid pose, see `load_tum`.
     """
     return load_tum(path).trajectory
 
@@ -393,7 +393,8 @@ def _read_table(
     """The rows of a table; `without` is the number of a line that is none of them.
 
     Raises:
-        TrajectoryError: As `read_table`.
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns`
+            numbers.
     """
     values = array("d")
     numbers = list[int]()

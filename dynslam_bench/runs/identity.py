@@ -80,7 +80,7 @@ class ResolvedRun:
         anchors: The folders in which names of files begin that plug-ins and programs read.
         foreign: Whether plug-ins or programs take part: what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
-        files: Those that the tracker's command names, in the identity by their content.
+        files: Files that the tracker's command names; their content is part of the identity.
     """
 
     spec: RunSpec
@@ -176,7 +176,8 @@ class Resolver:
         added after its run.
 
         Raises:
-            DynslamError: As `resolve`.
+            DynslamError: A name of the request is not known, or a setting does not fit, see
+                `resolve`.
         """
         spec = spec.absolute()
         configured = self._configuration(spec)
@@ -421,9 +422,9 @@ def start_map_of(
 
     Args:
         settings: A tracker's complete settings.
-        camera: Of the sequence, as the tracker sees it.
-        sensors: Of the tracker.
-        digests: Of the files that the settings name, by the setting's name.
+        camera: Intrinsics of the sequence's images, as the tracker sees them.
+        sensors: Sensors that the tracker uses.
+        digests: Digests of the files that the settings name, by the setting's dotted name.
 
     Raises:
         SettingsError: The tracker has features of its own; the file is no map, or one of another

@@ -396,7 +396,12 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         data_root: Folder of the sequences.
 
     Returns:
-        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always
+        One dictionary a sequence: its ``id``, whether it is ``here`` on this machine (rendered ones
+        always are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
+        ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout``
+        says whether the reader was ``verified`` on the publisher's files or ``not verified``;
+        ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before
+        it is fetched, None for what is rendered.
         are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
         ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout`` says
         whether the reader was ``verified`` on the publisher's files or ``not verified``;

@@ -467,7 +467,7 @@ class _Actor:
 
         Args:
             index: The frame.
-            camera: Of the image.
+            camera: Intrinsics of the host's image.
             upsampled: By how much the cutout's resolution is increased.
         """
         # Points of the earlier cutout, moved towards the later one.

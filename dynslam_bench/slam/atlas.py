@@ -63,7 +63,7 @@ class Atlas:
 
     Args:
         slam_map: Keyframes and points of all maps.
-        submaps: Those of a loaded map, from number 1 on.
+        submaps: Submaps of a loaded map; they get the numbers from 1 on.
         unit_ratio: By how much units of length of two maps may differ: 1 with depth.
 
     Attributes:
@@ -101,7 +101,7 @@ class Atlas:
         Args:
             number: The submap, or 0.
             T_before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
-            T_after: Those from now on.
+            T_after: World-to-camera poses ``[K, 4, 4]`` of these keyframes from now on.
             scales: What lengths around each were multiplied by ``[K]``.
         """
         centres = se3.inverse(T_before)[:, :3, 3]

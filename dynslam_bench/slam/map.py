@@ -333,7 +333,7 @@ class Map:
         Args:
             number: The submap.
             T_new_old: From the submap's world to the world of the other, ``[4, 4]``.
-            merged_into: The other's number.
+            merged_into: Number of the submap that it becomes part of.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
         # scale the keyframes' translations, then move their poses: T_cam_new = T_cam_old T_new_old^-1

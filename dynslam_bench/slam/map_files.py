@@ -163,7 +163,7 @@ class SavedMap:
 
         Args:
             camera: The system's.
-            features: Those that it extracts.
+            features: The kind of features that the system extracts.
             sensors: ``rgbd`` or ``rgb``.
             file: For the message.
 

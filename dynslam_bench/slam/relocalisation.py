@@ -625,7 +625,7 @@ class RotationEstimate:
 
         Args:
             T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
-            T_now_world: That of now.
+            T_now_world: World-to-camera pose ``[4, 4]`` now.
             more: How far the two worlds may be rotated against each other, radians.
         """
         difference = T_now_world @ se3.inverse(self.applied(T_last_world))

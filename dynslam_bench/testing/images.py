@@ -95,7 +95,7 @@ def check_keypoints(
 
     Args:
         keypoints: The extractor's result.
-        shape: Of the image, ``(H, W)``.
+        shape: Shape of the image, ``(H, W)``.
         descriptor_bytes: The length that the spec states, if it is known.
 
     Raises:

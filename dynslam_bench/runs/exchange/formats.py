@@ -41,7 +41,7 @@ def read_trajectory(
             VSLAM-LAB's, a folder of COLMAP's text files (or its ``images.txt``), or a bag.
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one
             each, for COLMAP a list of stamps and images such as ``rgb.txt``.
-        topic: Of a bag with several topics of poses, the one to take.
+        topic: The topic to take of a bag that has several topics of poses.
 
     Raises:
         DynslamError: A file cannot be read, is malformed, or stamps are missing.
@@ -113,7 +113,7 @@ def write_colmap(
     Args:
         folder: Where; it exists.
         trajectory: Camera-to-world poses, one an image.
-        camera: Of all images.
+        camera: The camera of all images.
         names: The image of each pose, relative to the folder of images.
         cloud: Map points, written without tracks and with the error 0, neither of which is known;
             None for none.
@@ -286,9 +286,9 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) 
     """Write a trajectory: each pose at its stamp, and all of them as a path at the first one.
 
     Args:
-        writer: Of the bag.
+        writer: Writer of the bag, from ``rosbags``.
         store: The types of the messages.
-        name: Of the trajectory.
+        name: Name of the trajectory, the first part of its topics.
         trajectory: Camera-to-world poses.
     """
     types = store.types

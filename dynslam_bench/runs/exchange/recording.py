@@ -46,7 +46,7 @@ class RecordedFrame:
     """A frame of a recording.
 
     Attributes:
-        index: Of the frame in the run's part of the sequence.
+        index: Index of the frame in the run's part of the sequence.
         stamp: Seconds.
         jpeg: The image at half size, see `encode`.
         pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it
@@ -97,7 +97,7 @@ def write_recording(
 
     Args:
         path: The file.
-        camera: Of the images.
+        camera: Intrinsics of the images at full size.
         name: Recording's name in the viewer.
         frames: In order.
         tracks: The estimate, and the truth in its frame.
@@ -144,7 +144,7 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
     Args:
         rr: The library.
         stream: The recording.
-        camera: Of the images at full size.
+        camera: Intrinsics of the images at full size.
         frames: The frames.
     """
     # width and height of the images in the recording, and what they are of those at full size
@@ -188,7 +188,7 @@ def _log_camera(
     Args:
         rr: The library.
         stream: The recording.
-        camera: Of the images at full size.
+        camera: Intrinsics of the images at full size.
         size: Width and height of the images in the recording.
         scale: What these are of those at full size.
     """
@@ -301,8 +301,8 @@ def _snapshots(folder: Path, camera: Camera) -> dict[int, Snapshot]:
 
     Args:
         folder: The run's.
-        camera: Of the sequence's images, in pixels of which the features are given: the tracker's
-            preprocessing may have resized them.
+        camera: Intrinsics of the sequence's images. The features are given in their pixels, though
+            the tracker's preprocessing may have resized the images.
     """
     (height, width), snapshots = read_snapshots(folder)
     scale = np.array([camera.width / max(width, 1), camera.height / max(height, 1)])

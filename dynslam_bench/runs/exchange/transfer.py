@@ -262,7 +262,7 @@ class Provenance(Record):
     """What an export was made of.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         format: Name of the format.
         files: SHA-256 of every file by its name.
         which: Which trajectory: ``online`` or ``final``.
@@ -382,7 +382,7 @@ def import_trajectory(
         camera: Camera of a folder that does not say its own.
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one
             each, in seconds, for COLMAP a list of stamps and images.
-        topic: Of a bag with several topics of poses, the one to take.
+        topic: The topic to take of a bag that has several topics of poses.
         truth: Ground truth of a sequence whose images are not here, in a format of
             `read_trajectory`, with the same `timestamps` where it has none. Its frames are not
             known then, and so is the coverage.

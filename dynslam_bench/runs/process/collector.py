@@ -125,7 +125,8 @@ class FileNote:
 
     Attributes:
         stamp: What it was then; None where it was not there.
-        digest: Of its content then; empty where it is still to be taken.
+        digest: Digest of the file's content when it was opened; empty where it is still to be
+            taken.
     """
 
     stamp: Stamp | None
@@ -210,7 +211,7 @@ class Collector:
         """What was read so far.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         imports = modules.imports
         programs, distributions = self._programs(imports)
@@ -328,7 +329,7 @@ class Collector:
         """The first thing that has changed since it was read, in words; empty where nothing has.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         for path, note in self.notes.files.items():
             self.compare(path, note, stamp_of(path))

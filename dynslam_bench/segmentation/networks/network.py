@@ -88,8 +88,8 @@ class RPN(nn.Module):
 
         Args:
             levels: P2..P6.
-            height: Of the padded input.
-            width: Of the padded input.
+            height: Height of the padded input, pixels.
+            width: Width of the padded input, pixels.
             sizes: Height and width of each image inside the padded input.
 
         Returns:
@@ -148,9 +148,9 @@ def rpn_loss(
     """Losses of objectness and of box codes (Ren et al. 2015, Eq. 1), 256 anchors an image, half of them positive.
 
     Args:
-        anchors: Of each level.
-        logits: Of each level ``[B, N_l]``.
-        codes: Of each level ``[B, N_l, 4]``.
+        anchors: Anchors ``[N_l, 4]`` of each level, input pixels.
+        logits: Objectness logits ``[B, N_l]`` of each level.
+        codes: Box codes ``[B, N_l, 4]`` of each level.
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
@@ -202,7 +202,7 @@ def roi_align(
     Args:
         features: Levels ``[B, C, H_l, W_l]``, finest first.
         boxes: One ``[K_b, 4]`` an image, input pixels.
-        image_height: Of the network's input; gives the levels' scales.
+        image_height: Height of the network's input, pixels; gives the levels' scales.
         size: Bins a side.
         canonical: Box side that goes to the third level.
 
@@ -370,10 +370,10 @@ class RoIHeads(nn.Module):
             levels: P2..P5 ``[1, C, H, W]``.
             mask_levels: m2..m5.
             proposals: ``[K, 4]``.
-            image_height: Of the padded input.
+            image_height: Height of the padded input, pixels.
             size: Height and width of the image inside it.
             score: Least score.
-            iou: Of the suppression within a class.
+            iou: IoU above which the weaker of two boxes of one class is suppressed.
         """
         # classes and boxes of the proposals
         pooled = roi_align(
@@ -423,11 +423,11 @@ class RoIHeads(nn.Module):
         Args:
             levels: P2..P5.
             mask_levels: m2..m5.
-            proposals: Of each image.
+            proposals: Proposals ``[P, 4]`` of each image: x0, y0, x1, y1, input pixels.
             truths: Boxes ``[G, 4]`` of each image.
             labels: Class numbers ``[G]`` of each image.
             masks: Bool ``[G, H, W]`` of each image, at the input's size.
-            image_height: Of the padded input.
+            image_height: Height of the padded input, pixels.
             generator: Draws the sample.
             per_image: How many proposals an image enter the losses.
         """

@@ -853,7 +853,7 @@ def measure_depth(
     Args:
         row0: First row.
         row1: One past the last row.
-        seed: Of this frame's noise.
+        seed: Seed of this frame's noise.
         sensor: The depth camera.
         depth: Exact z-depth ``[H, W]``, metres.
         cosine: Cosine of incidence ``[H, W]``.

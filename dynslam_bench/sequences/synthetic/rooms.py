@@ -428,7 +428,7 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
 
     Args:
         start: One end, metres.
-        end: The other.
+        end: Other end, metres.
         plan: Its colour.
         doors: Middles of the doorways, metres from `start`, in order.
     """

@@ -193,7 +193,7 @@ def read_declared(table: Mapping[str, Any], where: str, prefix: str = "") -> Dec
     Args:
         table: Name to the fields of `ProgramSetting`, or to a group.
         where: The file, for messages.
-        prefix: Of the names; ends in a dot, or is empty.
+        prefix: Prefix of the names: ends in a dot, or is empty.
 
     Raises:
         SettingsError: A name or a field does not fit.
@@ -779,7 +779,7 @@ def describe_batch(value: str) -> dict[str, Any]:
 
 
 def describe_served(value: str) -> dict[str, Any]:
-    """The same for `subprocess:FILE.toml`; nothing for `subprocess:COMMAND`.
+    """What the file of `subprocess:FILE.toml` says, as fields of its `TrackerSpec`; empty for `subprocess:COMMAND`.
 
     Raises:
         SettingsError: It is damaged.
