@@ -124,7 +124,7 @@ def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
     """The ``info`` of a step with every key that may be missing: 0 with a flag ``has_<key>`` that is False.
 
     Args:
-        info: Of a step.
+        info: The ``info`` dictionary of a step.
         protocol: Whose metrics are those of the episode.
     """
     missing: dict[str, Any] = {"pose": np.zeros(7)} | dict.fromkeys(_ERRORS, 0.0)

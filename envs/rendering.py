@@ -171,7 +171,7 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
     Args:
         rgb: The image, uint8 ``[H, W, 3]``, red first.
         result: What the tracker said of it.
-        width: Of the result, whose pixels are square as the image's.
+        width: Width of the returned image, pixels; its pixels are square as the image's.
     """
     # the dynamic mask, blended and outlined
     image = np.array(rgb, dtype=np.uint8)

@@ -295,7 +295,7 @@ def pages_for(runs: int, typical: int) -> int:
 
     Args:
         runs: Runs of the report.
-        typical: Those of them with the median error of their cell.
+        typical: Runs among them that have the median error of their cell.
     """
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
@@ -885,8 +885,9 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
-        most_pages: As in `build_report`; the pictures of a run take about 0.4 MB.
-        on_progress: As in `build_report`.
+        most_pages: Runs that have a page of their own, see `build_report`; the pictures of a run
+            take about 0.4 MB.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
         ReportError: There are no runs, or the folder of a study holds no page.

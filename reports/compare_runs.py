@@ -79,8 +79,8 @@ def compare(
     the fewest values.
 
     Args:
-        a: Results folder, store, or folder of a report (``report.json``).
-        b: The other results folder, store, or folder of a report.
+        a: First side: a results folder, a store, or the folder of a report (``report.json``).
+        b: Second side, named in one of these ways.
         protocol: How results folders are evaluated; a report brings its own.
         output: Folder of a page that shows it; None for none.
         conclusion: What the page says in place of the verdict, where another rule judged the runs.

@@ -285,7 +285,7 @@ def error_figure(board: Board) -> go.Figure | None:
 
 
 def _pareto_front(points: Collection[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those of some speeds and ratios that no other beats in both, the slowest first."""
+    """Points (speed, ratio) that no other point beats in both, the slowest first."""
     front = []
     for speed, ratio in points:
         others = [point for point in points if point != (speed, ratio)]

@@ -107,7 +107,7 @@ class StudyEvent:
     Attributes:
         kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or
             ``finished`` (a trial).
-        number: Of the trial.
+        number: Number of the trial.
         total: How many there are to be.
         text: One line.
     """

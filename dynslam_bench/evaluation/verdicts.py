@@ -48,7 +48,7 @@ _TIE = 1e-12
 _MANY_TIES = math.sqrt(0.5)
 """Share of ties above which the pseudo-median is one: its square is the share of pairs of ties."""
 _WILCOXON_EFFICIENCY = 3.0 / math.pi
-"""Pitman's efficiency of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes."""
+"""Pitman's efficiency of the signed-rank test on normal values: it needs 1 / 0.955 times the scenes of the t test."""
 _MOST_SCENES = 100_000
 
 

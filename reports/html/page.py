@@ -35,7 +35,7 @@ class Block:
         figure: The figure.
         caption: Below the figure.
         text: The code.
-        entries: Of the list.
+        entries: Entries of the list.
         folded: Whether it is closed at first, behind its title.
     """
 

@@ -103,7 +103,7 @@ class Board:
             known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
-        common: Those of them that the standings are taken over, each recording once.
+        common: Sequences that the standings are taken over, each recording once.
         copies: Sequence to the one before it whose true path it has: the same recording, by
             another name or with other pixels.
         short: Sequence to what is left of its name without the parts that all share.
@@ -502,7 +502,7 @@ def rank(
     Args:
         board: Gives cells and reference.
         scored: Trackers to place.
-        ranked: Those of them that are ranked.
+        ranked: Trackers among `scored` that are ranked.
         score: Error of a run in metres, or None to leave it out.
     """
     # errors in metres of every tracker, by sequence
@@ -639,13 +639,13 @@ class Pair(NamedTuple):
 
     Attributes:
         one: Variant key of the first tracker.
-        other: That of the second.
+        other: Variant key of the second tracker.
         ratio: Geometric mean of the errors of the first over those of the second where both succeed; over all
             sequences where they succeed on none together.
         sequences: Sequences behind it.
         lost: Sequences that the first alone lost, and the second alone.
         p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
-        verdict: Of the first; empty unless both are ranked.
+        verdict: What the test says of the first tracker; empty unless both are ranked.
         scope: How far that goes.
     """
 
@@ -867,7 +867,7 @@ class Cell:
 
     Attributes:
         rows: The runs, ordered by repeat.
-        kept: Those that count: of runs that differ in their seed only and have equal results, one.
+        kept: Runs that count: of runs that differ in their seed only and have equal results, one.
     """
 
     rows: tuple[RunRow, ...]
@@ -1107,10 +1107,10 @@ def load_frame(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        trials: As in `build_report`.
+        trials: Whether the trials of studies count like other runs.
 
     Returns:
-        As `Board.frame`.
+        One line a run, with the columns of `Board.frame`.
 
     Raises:
         ReportError: There are no runs.
@@ -1132,13 +1132,14 @@ def load_board(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        reference: As in `make_board`.
-        on: As in `make_board`.
-        rank_seen: As in `make_board`.
-        trials: As in `build_report`.
+        reference: Tracker id that errors are divided by, see `make_board`.
+        on: Which sequences the ranking is taken over: ``common`` or ``all``, see `make_board`.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks
+            was trained on.
+        trials: Whether the trials of studies count like other runs.
 
     Raises:
-        ReportError: As `make_board`.
+        ReportError: There are no rows, they mix protocols, or no run is of the reference.
     """
     loaded = load_runs(open_stores(results), get_protocol(protocol), trials=trials)
     return make_board(loaded.rows, reference, on, rank_seen=rank_seen)

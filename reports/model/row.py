@@ -274,7 +274,7 @@ class ReportData(Record):
     """What a report was made of, as it lies beside it; `compare` reads it back.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         title: Title of the report.
         protocol: Description of the protocol.
         reference: Tracker that errors are divided by.

@@ -262,7 +262,7 @@ class Duel(NamedTuple):
     """Two trackers on the sequences where both succeed, and what they lost.
 
     Attributes:
-        test: Of the log ratios of the first to the second.
+        test: Test of the log ratios, first over second.
         lost: Sequences that the first alone lost, and the second alone.
     """
 
@@ -284,8 +284,8 @@ def duel(log: Array, other: Array, sequences: Sequences) -> Duel:
     """Compare two trackers; with fewer than `FEWEST` sequences where both succeed only their losses tell.
 
     Args:
-        log: Log errors of the first ``[S]``; nan where it lost.
-        other: Those of the second.
+        log: Log errors of the first tracker ``[S]``; nan where it lost.
+        other: Log errors of the second tracker ``[S]``; nan where it lost.
         sequences: The sequences.
     """
     differences = log - other
@@ -314,10 +314,10 @@ def claims_against(
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
-        lost: Tracker to which sequences it lost ``[S]``.
-        base_lost: Which the reference lost.
+        lost: Tracker to which sequences it lost, bool ``[S]``.
+        base_lost: Which sequences the reference lost, bool ``[S]``.
     """
     claims = dict.fromkeys(logs, Claim("cannot tell"))
     others = [key for key, log in logs.items() if not np.array_equal(log, base)]
@@ -357,11 +357,11 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
 
     Args:
         logs: Ranked trackers to the logarithms of their median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
 
     Returns:
-        Of a typical (median) tracker; 1 where nothing can be shown.
+        Both differences of a typical (median) tracker; 1 where nothing can be shown.
     """
     others = [log for log in logs.values() if not np.array_equal(log, base)]
     tests = [sequences.test(log - base) for log in others]
@@ -463,7 +463,7 @@ def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
     """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
 
     Args:
-        logs: As in `separable`.
+        logs: Tracker to the logarithms of its median errors ``[S]``; nan where it lost.
 
     Returns:
         The p value of all trackers being alike, and the difference above which two mean ranks are

@@ -44,8 +44,8 @@ _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 
 """Samples of a pixel on an edge (a rotated grid), pixels from its centre."""
 
 _ROW_ITERATIONS = 5
-"""Iterations of the search for the row that sees a point. Each shrinks the error to a tenth or less: a point moves by at
-most 0.1 rows while one row is read."""
+"""Iterations of the search for the row that sees a point. Each shrinks the error to a tenth or less: a point moves by
+at most 0.1 rows while one row is read."""
 _MARGIN_PX = 2.0
 """Added around the bounds of a primitive in the image."""
 _SAMPLED_ROWS = 9
