@@ -170,9 +170,11 @@ class Preview(Record):
                 f"A design that proves {100 * GAIN:.0f} % in four of five has {self.needed} held-out scenes with one "
                 f"start each (offsets = [0]); clips of 40 frames show as much as longer ones."
             )
-        lines.append(
-            f"The study takes about {max(1, math.ceil(self.minutes))} min if no trial is pruned."
-        )
+        basis = ""
+        if not self.runs:
+            basis = f", at {1000 * FRAME_S:.0f} ms a frame: no run of the baseline is stored that tells more"
+        minutes = max(1, math.ceil(self.minutes))
+        lines.append(f"The study takes about {minutes} min if no trial is pruned{basis}.")
         return lines
 
     @property

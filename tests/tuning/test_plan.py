@@ -73,12 +73,14 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert before.runs == 0
     assert before.spread == pytest.approx(USUAL_SPREAD)
     assert before.scenes == 3
+    assert "50 ms a frame" in before.figures[-1], "an assumption is stated as one"
     assert not (tmp_path / "studies").exists(), "looking makes no study"
     run_study(make(folders), results=tmp_path)
     after = Plan(make(folders), tmp_path).preview(jobs=2)
     assert after.runs == 3
     assert after.spread >= before.spread
     assert after.minutes != before.minutes
+    assert "ms a frame" not in after.figures[-1]
     assert after.unused == {}
     assert "3 scenes judge this study; below 6 it claims nothing" in after.figures[0]
     assert after.power == 0.0
