@@ -245,7 +245,7 @@ class AccuracyMinusCost:
         return self.weight * (1.0 + self.growth * outcome.index) * self.cost_of(outcome)
 
     def cost_of(self, outcome: FrameOutcome) -> float:
-        """What a frame cost, in units of the cost."""
+        """Cost of a frame: network calls, thousands of keypoints, or seconds of the processor."""
         costs: dict[Cost, float] = {
             "network_calls": outcome.stats.get("segmented", 0.0),
             "keypoints": outcome.stats.get("keypoints", 0.0) / 1000.0,

@@ -475,7 +475,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.sequence = _part(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
-        """What an episode's state depends on, in words; equal where it can be restored."""
+        """Description of everything an episode's state depends on; equal where the state can be restored."""
         whole = self._whole
         frames = digest([whole.digest(), content_digest(whole.timestamps)])
         return {
@@ -778,7 +778,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
 
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
-    """The frames of a window."""
+    """View of a sequence's frames from ``window[0]`` up to, without, ``window[1]``; the whole is returned as it is."""
     if window == (0, len(whole)):
         return whole
     return cast("FrameSequence", SequenceView(whole, *window))

@@ -391,7 +391,7 @@ def keypoint_tokens(
 
 
 def privileged_observation(episode: Episode) -> NDArray[np.float32]:
-    """What the ground truth says of the last frame, float32 ``[11]`` (`PRIVILEGED_LAYOUT`); 0 where it is silent."""
+    """Errors and true motion of the last frame, float32 ``[11]`` (`PRIVILEGED_LAYOUT`); 0 without ground truth."""
     values = np.zeros(len(PRIVILEGED_LAYOUT))
     now = episode.outcomes[-1].error
     before = episode.outcomes[-2].error if len(episode.outcomes) > 1 else None

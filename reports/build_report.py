@@ -131,7 +131,7 @@ Fact = tuple[str, str, list[str]]
 
 @dataclass(frozen=True)
 class _Content:
-    """What a report shows, before it is written.
+    """Content of a report before it is written.
 
     Attributes:
         title: Heading.

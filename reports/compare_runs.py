@@ -39,7 +39,7 @@ Variants = Mapping[str, list[RunRow]]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from A to B.
+    """Changes from A to B: every tracker's errors on the common sequences, and the verdict.
 
     Attributes:
         overall: Tracker and what differs to B's median ATE over A's: the typical ratio over
@@ -374,7 +374,7 @@ def _numbers(ratio: PairedRatio) -> list[float | None]:
 
 
 def _sentence(ratio: PairedRatio) -> str:
-    """What was found, as the page says it."""
+    """The finding in a sentence, as the page says it."""
     return f"{'. '.join(findings(ratio, 'B'))}. Verdict: {verdict_of(ratio).value}."
 
 

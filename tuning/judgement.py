@@ -122,7 +122,7 @@ class Candidate(Record):
 
 
 class StudySummary(Record):
-    """What came out of a study; `summary.json` in its folder.
+    """Result of a study; `summary.json` in its folder.
 
     Attributes:
         name: The study.

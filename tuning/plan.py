@@ -117,7 +117,7 @@ FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion
 
 
 class Preview(Record):
-    """What a study could show, before it runs.
+    """Preview of a study before it runs: the differences that it could show, and its time.
 
     Attributes:
         scenes: Scenes that judge it: held-out ones, or those of `confirm`.
@@ -192,7 +192,7 @@ class Preview(Record):
 
 
 class Plan:
-    """What follows from a study alone; nothing runs, and nothing is stored.
+    """A study resolved before it runs: trackers, baseline, search space, instances; nothing is stored.
 
     Args:
         spec: The study.
@@ -315,7 +315,7 @@ class Plan:
         return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
-        """What a configuration of the space runs with: its tracker, and those settings that it has."""
+        """Tracker and settings that a configuration of the space runs with."""
         settings = {**self.held, **params}
         tracker = str(settings.pop(TRACKER, self.spec.tracker))
         if len(self.trackers) > 1:
@@ -434,7 +434,7 @@ class Design:
 
     @property
     def judging(self) -> tuple[ProblemInstance, ...]:
-        """What judges: the held-out instances, or else `confirm`."""
+        """Instances that judge: the held-out ones, or else `confirm`."""
         return self.held_out or self.confirm
 
 
@@ -638,7 +638,7 @@ def _check_repeats(
 
 
 def _images(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
-    """What decides the images that a tracker sees, and the numbers that it draws, within a scene."""
+    """Key of the images that a tracker sees, and of the random numbers that it draws, within a scene."""
     return part.block, part.noise, instance.offset, instance.degradation, instance.seed
 
 

@@ -379,7 +379,7 @@ _ALIVE = "alive "
 
 
 class Heartbeats:
-    """Which workers of a study live.
+    """Watches which workers of a study are alive.
 
     One of this machine is dead once its process is, any other one once the number that it counts up
     in the study's attributes has stood still for `GRACE_S` on this process' clock.

@@ -125,7 +125,7 @@ OnRun = Callable[[RunEvent], None]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a trial came to.
+    """Outcome of a trial.
 
     Attributes:
         state: Complete, pruned or failed; waiting if it was interrupted, and is to be run again.
@@ -466,7 +466,7 @@ class Study(Plan):
         return trials_frame(self.spec, self.study)
 
     def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
-        """What a trial runs with."""
+        """Tracker and settings that a trial runs with."""
         return self.configuration(trial.params)
 
     def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
@@ -810,7 +810,7 @@ class Study(Plan):
             )
 
     def _identify(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed, by name.
+        """Identity of a study: everything that must be the same when it is resumed, by name.
 
         Beside the study's fields these are the baseline's settings, the content of its sequences,
         and the program that runs on them: code, weights, libraries, device.

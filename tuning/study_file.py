@@ -47,7 +47,7 @@ _FORM = (
 
 @dataclass(frozen=True, order=True)
 class ProblemInstance:
-    """What a configuration is tried on: some frames of one sequence, from one start.
+    """Frames that a configuration is tried on: a part of one sequence, from one start.
 
     Attributes:
         sequence: Id or folder of the sequence.
@@ -86,7 +86,7 @@ class ProblemInstance:
 
     @property
     def scene(self) -> str:
-        """What is filmed, as far as the name tells: equal for all parts, lengths, starts and noises of a sequence."""
+        """Name of the filmed scene: equal for all parts, lengths, starts and noises of a sequence."""
         return scene_of(self.sequence)
 
     def run_spec(self, tracker: str, **how: Any) -> RunSpec:

@@ -64,7 +64,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class SegmenterContext:
-    """What a segmenter is told of where it runs.
+    """The surroundings in which a segmenter runs: sequence, device, threads, source.
 
     Attributes:
         sequence_id: Id of the sequence.

@@ -145,7 +145,7 @@ class _Serializer(CompileResultCacheImpl):
 
 
 def _read(file: Path) -> bytes | None:
-    """What a file holds; None if it is missing, cut off, damaged or was written under another name."""
+    """The compiled kernel in a file; None if it is missing, cut off, damaged or was written under another name."""
     try:
         header, _, content = file.read_bytes().partition(b"\n")
     except OSError:

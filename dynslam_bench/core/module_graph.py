@@ -62,7 +62,7 @@ Reference = tuple[str, str]
 
 @dataclass(frozen=True)
 class ModuleCode:
-    """What is known of one module's source.
+    """One module's source: digest, imports and the names that it imports.
 
     Attributes:
         digest: Digest of the source's syntax, see `syntax_digest`.
@@ -303,7 +303,7 @@ def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _references(statement: ast.AST) -> dict[str, Reference]:
-    """What a statement imports from this package, by the name that it gives to it."""
+    """References to this package's names in an import statement, by the name that the statement binds."""
     references: dict[str, Reference] = {}
     if isinstance(statement, ast.Import):
         for alias in statement.names:

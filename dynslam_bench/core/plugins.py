@@ -32,7 +32,7 @@ Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequenc
 
 
 class Spec(Protocol):
-    """What every plug-in spec has."""
+    """The fields that every plug-in spec has."""
 
     @property
     def id(self) -> str:
@@ -190,7 +190,7 @@ class Registry(Generic[P]):
         return targets + self._installed()
 
     def _installed(self) -> list[Listed]:
-        """What the installed distributions list."""
+        """Entry points that the installed distributions list."""
         targets = []
         installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
         for point in sorted(installed, key=attrgetter("name")):

@@ -231,7 +231,7 @@ def _is_there(path: str) -> bool:
 
 @dataclass
 class ProgramReads:
-    """What the processes of a program were made of.
+    """Files and commands of a program's processes.
 
     Attributes:
         files: Executables and everything that is mapped into memory, each with its time of

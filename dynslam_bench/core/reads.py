@@ -151,7 +151,7 @@ _DIGESTS: dict[tuple[str, str, int, int, int, int], str] = {}
 
 
 def remembered(kind: str, path: str, compute: Callable[[], str]) -> str:
-    """What is computed from a file, once in this process while the file's size, times and inode stay the same.
+    """A value that is computed from a file, once in this process while the file's size, times and inode stay the same.
 
     Raises:
         OSError: It is not there.
@@ -219,7 +219,7 @@ def value_digest(value: str | None) -> str:
 
 
 def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> str:
-    """What a search path holds, or which file a command is.
+    """The folders of a search path, or the file that a command runs.
 
     Args:
         name: An environment variable that holds a search path; or `COMMAND` and the command's name.
@@ -466,7 +466,7 @@ _SECTIONS = (
 
 
 def _in_words(section: str, name: str, before: str) -> str:
-    """What a user calls an entry of `Reads`."""
+    """A name in words for an entry of `Reads`."""
     short = re.sub("^(plugin|work):/", "", name)
     match section:
         case "search" if name.startswith(COMMAND):

@@ -152,7 +152,7 @@ def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
 
 
 class AssociationRecord(Record):
-    """What was compared and what was dropped, as records hold it.
+    """Counts of the compared and the dropped poses, as records hold them.
 
     Attributes:
         n_estimate: Poses of the estimate.

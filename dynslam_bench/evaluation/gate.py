@@ -31,7 +31,7 @@ MARGIN = 0.10
 
 
 class GateVerdict(str, Enum):
-    """What a gate says of the candidate's errors."""
+    """A gate's verdict on the candidate's errors."""
 
     IDENTICAL = "identical"
     IMPROVED = "improved"

@@ -663,7 +663,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
 
 @dataclass(frozen=True)
 class Convention:
-    """What poses may be in place of camera-to-world matrices.
+    """A convention that poses may follow in place of camera-to-world matrices.
 
     Attributes:
         id: Id of the hint that names this convention.

@@ -53,7 +53,7 @@ _MOST_SCENES = 100_000
 
 
 class Verdict(str, Enum):
-    """What a comparison says of the candidate."""
+    """A comparison's verdict on the candidate."""
 
     PROVEN = "proven"
     BUT_LOST = "smaller typical error, but lost"

@@ -63,7 +63,7 @@ class Measurement(Record):
 def measurement_of(
     case: str, number: int, record: RunRecord, store: RunStore, protocol: Any
 ) -> Measurement:
-    """What a gate keeps of a stored run.
+    """The measurement that a gate keeps of a stored run.
 
     Args:
         case: Name of what was run.
@@ -153,7 +153,7 @@ def _matrix(rows: list[list[float | None]]) -> Array:
 
 
 class Origin(Record):
-    """Which program one side of a gate is.
+    """Origin of the program that one side of a gate runs: name, commit, uncommitted files.
 
     Attributes:
         name: In words: a revision, ``the working tree``, ``the recorded runs``.

@@ -413,7 +413,7 @@ def check(
 
 @dataclass
 class _Outcome:
-    """What a gate found, and how.
+    """Findings of a gate, and the rounds and runs that they took.
 
     Attributes:
         findings: What both sides show.
@@ -653,7 +653,7 @@ def _result(
     place: Path,
     notes: list[str],
 ) -> GateResult:
-    """What was found, in words and numbers."""
+    """The findings as a `GateResult`, in words and numbers."""
     findings = outcome.findings
     estimate = findings.estimate
     result = GateResult(

@@ -133,7 +133,7 @@ class Gate:
         return self.path.parent
 
     def cases(self, *, confirm: bool = False) -> Cases:
-        """What a round runs, by name.
+        """Run specs of a round, by the name of their case.
 
         Args:
             confirm: The confirmation set in place of the development set.

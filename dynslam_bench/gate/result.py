@@ -65,7 +65,7 @@ class GuardrailResult(Record):
 
 
 class GateResult(Record):
-    """What a gate found.
+    """Result of a gate: verdict, guardrails and every sequence.
 
     Attributes:
         schema_version: Version of this record's fields.

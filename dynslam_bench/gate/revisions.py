@@ -24,7 +24,7 @@ _LAST_LINES = 3
 
 
 def git(folder: Path, *arguments: str) -> str:
-    """What git writes about a folder, without white space around it.
+    """The output of a git command in a folder, without white space around it.
 
     Raises:
         RunError: Git is not installed, or refuses.

@@ -368,7 +368,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _parts(line: str) -> list[str]:
-    """What stands in a line before a comment, split at commas and spaces."""
+    """The fields of a line, split at commas and spaces; a comment is left out."""
     return line.partition("#")[0].replace(",", " ").split()
 
 

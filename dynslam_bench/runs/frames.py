@@ -55,7 +55,7 @@ _TIME_SUFFIX = "_s"
 
 @validated(frozen=True, config=ConfigDict(extra="forbid"))
 class FrameRow:
-    """What is kept of one frame.
+    """One row of a run's table of frames.
 
     Attributes:
         index: Index of the frame in the run's part of the sequence.

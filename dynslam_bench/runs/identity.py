@@ -298,7 +298,7 @@ def _asked(
     device: str,
     start_map: StartMap | None,
 ) -> dict[str, Any]:
-    """What of a run's identity was asked for: the entries `record.ASKED`."""
+    """The request in a run's identity: the entries `record.ASKED`."""
     settings = configured.flat
     if start_map is not None:  # its digest is among the weights
         settings = settings | {MAP_SETTING: ""}

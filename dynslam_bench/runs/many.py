@@ -76,7 +76,7 @@ class RunEvent:
 
 @dataclass
 class Plan:
-    """What is to be made.
+    """Runs and frames that a call of `run_many` is to make.
 
     Attributes:
         runs: How many runs.

@@ -121,7 +121,7 @@ def run_one(
 
 
 def _job(run: ResolvedRun, work: Path, protocol: Protocol, progress_every: int) -> dict[str, Any]:
-    """What the child is told: the run, and how to report partial metrics."""
+    """The message to the child: the run, and how to report partial metrics."""
     job = make_job(
         WORK,
         work,

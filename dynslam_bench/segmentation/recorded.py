@@ -156,7 +156,7 @@ class RecordedSegmenter:
         return missing
 
     def _keys_of(self, timestamps: NDArray[np.float64]) -> list[float]:
-        """What frames are looked up by: their stamps in seconds, or their indices."""
+        """Keys by which frames are looked up: their stamps in seconds, or their indices."""
         return timestamps.tolist() if self.by_stamp else list(range(len(timestamps)))
 
     def _nearest(self, key: float) -> tuple[int, float]:

@@ -60,7 +60,7 @@ ROOT_MAP = 0
 
 
 class CameraStatus(Enum):
-    """What is known of the camera's place; the back end's states.
+    """States of the back end: how well the camera's place is known.
 
     `INITIALISING` becomes `TRACKED` with the first keyframe or, in a loaded map, when the camera is
     found. `TRACKED` becomes `LOST` with a frame that the map does not explain. `LOST` becomes
@@ -688,7 +688,7 @@ class RgbdBackend:
         return se3.inverse(T_cam_world), covariance
 
     def view(self) -> MapView:
-        """What filters may read of the map that the camera is in; `finalize` does not change it."""
+        """View for filters of the map that the camera is in; `finalize` does not change it."""
         return self._map_views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:

@@ -163,7 +163,7 @@ class Loop:
 
 
 class RootMapPose(Enum):
-    """What follows from a pose in the root map that was found for a camera in a submap."""
+    """Verdict on a pose in the root map that was found for a camera in a submap."""
 
     REJECTED = "rejected"
     """There is none, or it is ambiguous or cannot be reached: the frame is tracked in the submap alone."""

@@ -516,7 +516,7 @@ def map_outputs(slam_map: Map) -> MapOutputs:
 
 
 def _keyframe_record(slam_map: Map, slot: int) -> KeyframeRecord:
-    """What files hold of a keyframe."""
+    """The record of a keyframe that files hold."""
     return KeyframeRecord(
         int(slam_map.kf_id[slot]),
         int(slam_map.kf_frame[slot]),
@@ -556,7 +556,7 @@ class MapViews:
         }
 
     def of(self, submap: int) -> MapView:
-        """What filters see while the camera is in a submap."""
+        """View that filters get while the camera is in a submap."""
         slam_map = self._map
         if self._computed_for != (slam_map.next_keyframe, submap):
             self._computed_for = slam_map.next_keyframe, submap
@@ -567,7 +567,7 @@ class MapViews:
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
-        """What filters may read of a keyframe."""
+        """The part of a keyframe that filters may read."""
         slam_map = self._map
         n = int(slam_map.kf_count[slot])
         keypoints = Keypoints(

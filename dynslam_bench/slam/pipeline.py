@@ -269,7 +269,7 @@ class SlamPipeline:
         return keypoints, xy
 
     def _filter_state(self, frame: FrameBundle) -> FilterState:
-        """What filters may read beside the frame: the previous frame, the prediction and the map."""
+        """State that filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
         T_world_pred, covariance = self._backend.predict(frame.timestamp)
         keyframes, map_points = self._backend.view()

@@ -56,7 +56,7 @@ _NO_STAGES = ("total_s", "processor_s", "read_s")
 
 @dataclass(frozen=True)
 class RunPage:
-    """What the report needs of a run whose page was written.
+    """Entry in the report for a run whose page was written.
 
     Attributes:
         variant_key: Its tracker and settings.
@@ -381,7 +381,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
 
 
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
-    """What else is known of a run: name and text."""
+    """Rows (name, text) of the table of further numbers on a run's page; missing ones are left out."""
     # name, value, factor to the unit that is shown, unit
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),

@@ -88,7 +88,7 @@ class Sequences(NamedTuple):
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a tracker stands.
+    """Standing of a tracker on a board: its errors beside the reference, rank and verdict.
 
     Attributes:
         key: The tracker.
@@ -122,7 +122,7 @@ class Standing:
 
 
 class Claim(NamedTuple):
-    """What is claimed of a tracker beside the reference; fields as in `Standing`."""
+    """A claim on a tracker beside the reference; fields as in `Standing`."""
 
     verdict: Verdict
     scope: Scope = ""
@@ -385,7 +385,7 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
 
 
 class Order(NamedTuple):
-    """Which of two trackers is better.
+    """Result of the test of one tracker against another.
 
     Attributes:
         first_by: Below 0 where the first is shown to be better, above 0 where the second is, else 0.

@@ -231,7 +231,7 @@ def _layers(
 
 
 def _blueprint() -> Any:
-    """What the viewer shows at first: the scene on the left, the image and the numbers on the right."""
+    """Layout that the viewer shows at first: the scene on the left, the image and the numbers on the right."""
     import rerun.blueprint as rrb
 
     numbers = rrb.Horizontal(

@@ -60,7 +60,7 @@ PROVENANCE_FILE = "provenance.json"
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export_run` wrote.
+    """Files that `export_run` wrote, with notes on what they lack.
 
     Attributes:
         folder: Where.
@@ -259,7 +259,7 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
 
 
 class Provenance(Record):
-    """What an export was made of.
+    """Origin of an export: its run and the digests of its files.
 
     Attributes:
         schema_version: Version of this record's fields.
@@ -483,7 +483,7 @@ def import_trajectory(
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """What an imported trajectory is compared with.
+    """Stamps and ground truth that an imported trajectory is compared with.
 
     Attributes:
         part: The part of the sequence.
@@ -560,7 +560,7 @@ def _info_by_truth(part: Part, truth: Trajectory, name: str) -> SequenceInfo:
 
 
 class _Coverage(NamedTuple):
-    """Which frames of a sequence a trajectory covers.
+    """Coverage of a sequence's frames by a trajectory.
 
     Attributes:
         total: Frames of the sequence.

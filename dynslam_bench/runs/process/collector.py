@@ -135,7 +135,7 @@ class FileNote:
 
 @dataclass
 class Notes:
-    """What a recorder has noted so far.
+    """Files, folders, variables and commands that a recorder has noted so far.
 
     Attributes:
         files: Each file that was opened to be read.
@@ -208,7 +208,7 @@ class Collector:
         self._variables: dict[Command, set[str]] = {}
 
     def collect(self, modules: Modules) -> Reads:
-        """What was read so far.
+        """The record of what was read so far.
 
         Args:
             modules: The modules that are loaded now.

@@ -190,7 +190,7 @@ class ReadRecorder:
         return self._collector.collect(modules)
 
     def so_far(self) -> Reads:
-        """What was read so far; it may change until the end."""
+        """The record of what was read so far; it may change until the end."""
         with self._ignoring_own_reads():
             return self._collector.collect(self._collector.modules())
 

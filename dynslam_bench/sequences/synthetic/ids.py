@@ -65,12 +65,12 @@ class SyntheticId:
 
     @property
     def variant(self) -> Variant:
-        """What all scenes of this name share."""
+        """The settings that all scenes of this name share."""
         return VARIANTS[self.name]
 
     @property
     def split(self) -> Literal["tune", "held-out"]:
-        """Which split the scene belongs to."""
+        """Split that the scene belongs to."""
         return "held-out" if self.scene in HELD_OUT_SCENES else "tune"
 
     @property

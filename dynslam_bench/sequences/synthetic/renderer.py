@@ -392,7 +392,7 @@ class Renderer:
         return rows
 
     def _facets(self, view: View, pose: Array, lights: Array, texel_density: Array) -> Array:
-        """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
+        """Values of each face ``[P, 6, 5]``: its normal in the camera frame, light, texels a pixel at 1 m."""
         # Normals of boxes point outwards, those of quads along their z axis ...
         quads = self.scene.kind == QUAD
         axes = product(pose[:3, :3].T, view.rotation).transpose(0, 2, 1)

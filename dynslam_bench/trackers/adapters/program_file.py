@@ -310,7 +310,7 @@ class ProgramFile(Record):
 
     @property
     def decisive(self) -> dict[str, Any]:
-        """What of it decides a result, settings apart: words about it and ranges of settings do not."""
+        """The fields that decide a result, settings apart: words about the program and ranges of settings do not."""
         words = {"name", "settings", "presets", "version", "license", "citation"}
         return self.model_dump(mode="json", exclude=words)
 
