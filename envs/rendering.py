@@ -184,7 +184,7 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
         )
         cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
 
-    # scale
+    # resize the image before anything thin is drawn on it
     size = (width, round(image.shape[0] * scale))
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if result.keypoints_xy is None:

@@ -268,7 +268,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.action_space = self._actions.space()
         self.observation_space = observation_space(observation, self.sequence.camera)
 
-        # the episode
+        # no episode has begun before the first `reset`
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Canvas | None = None
@@ -633,7 +633,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             if preprocessing_of(self.settings) != preprocessing:
                 options = {"sequence": self._source, **options}
 
-        # sequence
+        # another sequence has to fit the observation space, which cannot change
         if "sequence" in options:
             self._use_sequence(options["sequence"])
             size = (camera.width, camera.height)
@@ -703,7 +703,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SequenceError: The frame cannot be read, or does not fit the sequence's camera.
             TrackerContractError: The tracker broke its contract.
         """
-        # read
+        # read the frame, with the user's transforms
         index = self.episode.next_index
         read_start = time.perf_counter()
         self._final = None
@@ -712,7 +712,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             frame = transform(frame)
         frame = read_only(frame)
 
-        # track
+        # track it, with wall-clock and processor time; errors inside count as the tracker's
         track_start = time.perf_counter()
         processor_start = time.process_time()
         with tracker_code():

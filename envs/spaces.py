@@ -370,7 +370,7 @@ def keypoint_tokens(
     tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
     is_keypoint = np.zeros(MOST_KEYPOINTS, np.int8)
 
-    # choose keypoints
+    # choose at most `MOST_KEYPOINTS` keypoints, evenly spread over their list
     xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
     keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
     rows = np.linspace(0, len(xy) - 1, min(len(xy), MOST_KEYPOINTS)).astype(np.intp)

@@ -401,7 +401,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         rows=content.board.rows,
     ).write(paths.data)
 
-    # the pages
+    # write the pages of the report
     write_assets(output)
     write_atomic(paths.html, _first_page(content, facts, footer))
     for page in content.sections:
@@ -766,7 +766,7 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
         loaded: What was read from the stores.
         again: The command that makes this report again.
     """
-    # commands
+    # commands that made the runs, each once
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     codes = {

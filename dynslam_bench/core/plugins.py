@@ -388,8 +388,8 @@ def _load_file(path: Path) -> ModuleType:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    # from its text: byte code of an edit of equal length in the same second would pass for that of
-    # this one
+    # compile its text: cached byte code of an edit of equal length within the same second would pass
+    # for that of this text
     try:
         exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
     except BaseException:

@@ -221,7 +221,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         flow_px = float(np.median(np.linalg.norm(x1 - x2, axis=1)))
         if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
-        # a plane
+        # one plane: a homography explains the matches as well, and F is not determined
         share = stats["homography_share"] = homography_share(x1, x2)
         return share > self.settings.homography_share
 

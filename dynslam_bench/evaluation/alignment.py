@@ -96,8 +96,8 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
     centre_target, unit_target, size_target = _centred(target)
     covariance = unit_target.T @ unit_source / len(source)
 
-    # how far the estimate's orientations are turned, summed: decides only what the positions leave
-    # open
+    # how far the estimate's orientations are turned, summed; they decide only what positions on a
+    # line leave open
     orientation = np.tensordot(
         ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))
     ) / len(source)

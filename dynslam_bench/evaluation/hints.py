@@ -162,8 +162,8 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     track = Track(stamps, poses)
 
-    # places on a grid of lags from which the estimate moves by a known displacement: some of them,
-    # without jumps
+    # places on a grid of lags from which the estimate moves by a known displacement; at most some
+    # 128 of them, and none at a jump
     at = _grid_places(track, step)
     moved = _displacements(track, stamps[0] + step * at, window)
     usable = np.flatnonzero(np.isfinite(moved[:, 0]))

@@ -385,14 +385,14 @@ def run_phase(
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
 
-            # evaluate them
+            # evaluate Eq. 1 for the labels, and keep each that is better than a flame
             for k in range(min(count, end - used)):
                 label = (trials[k, 0], trials[k, 1], trials[k, 2], trials[k, 3])
                 cost = label_cost(i, label, matching, costs[population - 1])
                 insert(flames, costs, trials, k, cost)
                 used += 1
 
-            # the next stage
+            # candidates are followed by the first population, its opposites, then the search itself
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
                 stage = INITIAL if phase == 0 and rules.moth_flame else SEARCH
@@ -738,8 +738,8 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
     keys = costs * len(costs) + np.arange(len(costs))
     # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
     good = np.sort(np.argpartition(keys, half - 1)[:half])
-    # where the good points lie and where their labels take them, one coordinate after the other for
-    # vector code
+    # where the good points lie and where their labels take them; coordinates are rows, so that the
+    # compiler makes vector code
     tracks = np.concatenate([points[good], points[good] + labels[good, :2]], axis=1).T.copy()
     random = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
     for motion in motions:

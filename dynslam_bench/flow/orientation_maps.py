@@ -126,8 +126,7 @@ def orientation_maps(
     quarter_rows = max(1, height // 4)
     quarter_columns = max(1, width // 4)
 
-    # the arrays of maps that were deleted, where they have the same size; they keep the zeros of
-    # their margins
+    # take the arrays of deleted maps where they have the same size: their margins are zero already
     shapes = (
         (geometry.total, layout.BINS),
         (height + 2 * BORDER, width + 2 * BORDER),

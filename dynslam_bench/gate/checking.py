@@ -443,7 +443,7 @@ def _checked(
     guarded = gate.config.guardrails
     times_count = guarded.frame_time is not None or guarded.memory is not None
 
-    # equality first
+    # one round first: a change that keeps every trajectory to the bit needs no more
     first = _started(
         stack, "first" if again and times_count else CANDIDATE, gate.folder, gate, place
     )

@@ -107,7 +107,7 @@ def judge(
     ratios = log_ratios(errors, errors_baseline)
     estimate = mean_ratio(ratios[is_compared], level) if is_compared.any() else None
 
-    # the verdict
+    # equal trajectories first, then the interval against the margin; more lost runs overrule both
     verdict = GateVerdict.UNDECIDED
     all_lost = lost.all() or lost_baseline.all()
     if are_identical(baseline, candidate, cases, rounds) and not all_lost:

@@ -188,7 +188,7 @@ def open_sequence(
         SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path
             and the command that fetches it), damaged, or no frame in the part asked for.
     """
-    # the whole sequence
+    # open all frames of the sequence
     settings = preprocessing or PreprocessingSettings()
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
@@ -327,7 +327,7 @@ def _open_whole(
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
 
-    # a folder
+    # the name is that of a folder, of a bag, or unknown
     if is_bag(path):
         raise SequenceError(
             f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"

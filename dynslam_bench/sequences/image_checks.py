@@ -80,7 +80,7 @@ class ImageStatistics:
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
-        # single images
+        # images without contrast or depth
         grays = [
             np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch
         ]

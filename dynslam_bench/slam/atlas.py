@@ -261,7 +261,7 @@ def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]
     arrays["obs_kf"] = row_of_keyframe[keyframe]
     arrays["obs_ft"] = feature
 
-    # submaps
+    # where each submap began, and how far it may lie from there
     places = np.array([(submap.start, submap.anchor) for submap in submaps]).reshape(-1, 2, 3)
     arrays["submap_start"] = places[:, 0]
     arrays["submap_anchor"] = places[:, 1]

@@ -630,7 +630,7 @@ class RgbdBackend:
         slam_map = self.map
         verdict = RootMapPose.REJECTED
 
-        # local mapping
+        # local mapping: insert the keyframe, triangulate, cull, adjust its neighbourhood
         slot, timings = self.mapper.insert(
             tracked.observations,
             tracked.point,
@@ -642,7 +642,7 @@ class RgbdBackend:
         self._reference_keyframe = slot
         self._transfer_history()
 
-        # loop closing
+        # loop closing: recognise an earlier place, and correct the map
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             T_before = slam_map.kf_pose[slot].copy()

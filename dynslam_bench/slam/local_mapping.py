@@ -211,7 +211,7 @@ class LocalMapper:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
         slam_map = self.map
         young = self._young[slam_map.alive[self._young]]
-        # in keyframes
+        # age in keyframes since the point was made
         age = slam_map.next_keyframe - 1 - slam_map.born[young]
         min_found_ratio = self.settings.mapping.min_found_ratio
         seldom_found = slam_map.found[young] < min_found_ratio * slam_map.visible[young]

@@ -583,7 +583,7 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     current_points = camera.unproject(frame.xy[has_depth], frame.z[has_depth])
     points = current_points @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
 
-    # their projections
+    # where they appear in the previous image, unless they would lie behind its camera
     ahead = points[:, 2] > MIN_PREDICTED_DEPTH_M
     rows = np.flatnonzero(has_depth)[ahead]
     guess[rows] = camera.distort_points(camera.project(points[ahead]))

@@ -488,7 +488,7 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         whole = truth or estimate
         start = 0.0 if whole is None else float(whole.timestamps[0])
 
-    # the true path
+    # curves of the true path, in seconds since the start
     series: Series = {}
     if truth is not None and len(truth) > 1:
         drawn = _of_part(row, truth)

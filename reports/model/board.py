@@ -299,26 +299,42 @@ class Board:
 
         Returns:
             One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``.
-            ``string`` columns: run_id, kind (``run here``, ``imported``), tracker, label, settings
-            (what sets the variant apart, ``name=value; ...``), provenance, sequence (name of the
-            column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
-            study (of which the run is a trial), protocol_id, protocol_digest, trajectory
-            (``online``, ``final``: whose errors they are), segmentation, computer (on which the
-            times were taken), program_remark (how many programs share the row, or how the results
-            differ from those of the program that ranks).
-            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed,
-                n_tracked.
-            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache),
-                seen_in_training
-            (whether the masks come from a network that was trained on the scene). ``Float64``:
-            coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks:
-            lost frames held, failures as a static camera or worse), hold_last_pose_ate_m,
-            final_ate_m and static_camera_ate_rmse_m (metres), frame_ms (median, milliseconds),
-            real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
-            (standard error in degrees of the alignment's rotation; above 10 the metrics
-            ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under its
-            own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see
-            `Evaluation`).
+
+            ``string`` columns:
+
+            - run_id, frames, split, repeat, status, segmentation, protocol_id, protocol_digest,
+              provenance, tracker, label;
+            - kind: ``run here`` or ``imported``;
+            - settings: what sets the variant apart, ``name=value; ...``;
+            - sequence: name of the column in tables; column_id: its key;
+            - ending: how a failed run ended;
+            - study: the study of which the run is a trial;
+            - trajectory: ``online`` or ``final``, whose errors they are;
+            - computer: where the times were taken;
+            - program_remark: how many programs share the row, or how the results differ from those
+              of the program that ranks.
+
+            ``Int64`` columns: seed, offset, noise (missing for the sequence's own), n_frames,
+            n_processed, n_tracked.
+
+            ``boolean`` columns:
+
+            - ranked, failed;
+            - cached: whether stage times come from the stage cache;
+            - seen_in_training: whether the masks come from a network that was trained on the scene.
+
+            ``Float64`` columns:
+
+            - coverage and epipolar_skipped: shares, 0 to 1;
+            - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
+              or worse;
+            - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
+            - frame_ms: median, milliseconds;
+            - real_time_factor; peak_memory_mb: MB; mask_iou: 0 to 1;
+            - rotation_uncertainty_deg: standard error in degrees of the alignment's rotation; above
+              10 the metrics ``ape_rot_*`` say nothing of the tracker;
+            - every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
+              ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
         """
         # column to its type: those that all frames have, then the metrics
         metrics = sorted(
@@ -440,7 +456,7 @@ def category_boards(board: Board) -> dict[str, Board]:
 
 def _fill_board(board: Board) -> Board:
     """Fill a board that has rows and labels: sequences, cells, ranking, reference, standings and order."""
-    # cells
+    # one cell for each tracker and sequence
     _order_sequences(board)
     by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
     board.cells = {
@@ -449,7 +465,7 @@ def _fill_board(board: Board) -> Board:
     }
     board.final_only = [key for key in board.labels if all(map(_has_final_only, board.runs(key)))]
 
-    # ranking
+    # who is ranked, beside which reference, and in which order
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
@@ -1001,7 +1017,7 @@ def missing_note(board: Board) -> str:
         why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
         sentences.append(f"Not ranked, since they {why}: {incomplete}.")
 
-    # the missing cells
+    # name the cells that are missing
     cells = []
     for key, names in list(missing.items())[:_MOST_MISSING]:
         others = f" and {len(names) - 4} more" if len(names) > 4 else ""

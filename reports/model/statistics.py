@@ -401,10 +401,10 @@ class Order(NamedTuple):
 def separable(logs: Mapping[str, Array], sequences: Sequences) -> dict[tuple[str, str], Order]:
     """Which trackers the sequences tell apart, Holm-corrected over all pairs.
 
-    The order of all pairs that are called separable is right together with a chance of at least 95
-    %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two trackers are
-    compared where both succeed. Who is better there and lost more sequences is not called better; who lost
-    more beyond chance (McNemar's exact test) is worse.
+    The order of all pairs that are called separable is right together with a chance of at least
+    95 %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two
+    trackers are compared where both succeed. A tracker that is better there and lost more sequences
+    is not called better; one that lost more beyond chance (McNemar's exact test) is worse.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of

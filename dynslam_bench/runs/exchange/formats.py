@@ -121,7 +121,7 @@ def write_colmap(
     Raises:
         DynslamError: A file cannot be written.
     """
-    # the camera
+    # one camera for all images
     model, parameters = _colmap_camera(camera)
     numbers = " ".join(f"{value:.12g}" for value in parameters)
     write_atomic(
@@ -138,7 +138,7 @@ def write_colmap(
         lines += [f"{number} {pose} 1 {name}", ""]
     write_atomic(folder / IMAGES, "\n".join(lines) + "\n")
 
-    # the map points
+    # the map points, without tracks and with the error 0
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     if cloud is not None:
         rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)

@@ -95,7 +95,7 @@ def parse_synthetic_id(text: str) -> SyntheticId:
         raise SequenceError(
             f"'{text}' is not the id of a rendered sequence", did_you_mean(text, SYNTHETIC_IDS)
         )
-    # the name
+    # the name, one of `VARIANTS`
     name = match["name"]
     if name not in VARIANTS:
         near = did_you_mean(f"synthetic/{name}", SYNTHETIC_IDS)

@@ -53,9 +53,8 @@ class UnfilteredSystemSettings(Settings):
 
     filters: ClassVar[tuple[tuple[str, ...], ...]] = ()
     """The rules in the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
-    settings that the class takes, its own first. A rule is left out where the settings lack one of
-    its groups, or where
-    its own group has ``enabled = false``."""
+    settings that the class takes, its own first. A rule is left out where the settings lack one of its groups, or
+    where its own group has ``enabled = false``."""
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
     backend: BackendSettings = BackendSettings()
