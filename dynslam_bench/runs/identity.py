@@ -184,7 +184,7 @@ class Resolver:
         tracker = configured.tracker
         settings = configured.settings
 
-        # open the sequence, cut to the frames that are asked for; refuse what the tracker cannot use
+        # open the sequence, cut to the frames asked for; refuse what the tracker cannot use
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
         sequence, part = self._part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)

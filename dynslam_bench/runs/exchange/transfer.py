@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -411,25 +411,72 @@ def import_trajectory(
         phrases = truth_file.notes.describe(repeats=True)
         notes += [f"ground truth: {phrase}" for phrase in phrases]
         reference = _reference_by_truth(sequence, truth_file)
-    part = reference.part
 
     # which of its frames the trajectory covers
-    stamps_s = to_seconds(reference.timestamps_ns)
-    coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{part.id}'")
-    if not reference.knows_frames:
-        coverage = _Coverage.of_all(len(trajectory), coverage.n_without_frame)
-        notes.append(
-            "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
-        )
-    elif coverage.n_without_frame:
-        notes.append(
-            f"{coverage.n_without_frame} of {len(trajectory)} poses carry stamps that are no input frame's"
-        )
-    total = coverage.total
-    covered = coverage.covered
-    status, reason = judge_coverage(covered, total, total - 1 - coverage.last, total)
+    coverage = _coverage(trajectory, reference, file)
+    notes += _coverage_notes(coverage, reference, poses=len(trajectory))
 
-    # an imported trajectory is identified by its file and by the frames that it belongs to
+    # its record, as that of a run: frames without a pose count as lost
+    identity = _identity_of_import(file, tracker, which, reference.part, timestamps, topic)
+    status, reason = judge_coverage(
+        coverage.covered,
+        coverage.total,
+        coverage.total - 1 - coverage.last,
+        coverage.total,
+    )
+    record = RunRecord(
+        kind="imported",
+        run_id=run_id_of(identity),
+        status=status,
+        reason=reason,
+        tracker=TrackerInfo(
+            id=tracker, label=label or f"{tracker} (imported)", provenance="external"
+        ),
+        sequence=reference.info(part_digest(identity)),
+        frames=None if frames is None else parse_frames(frames),
+        stride=stride,
+        n_frames=coverage.total,
+        n_tracked=coverage.covered,
+        n_lost=coverage.total - coverage.covered,
+        coverage=coverage.covered / coverage.total if reference.knows_frames else None,
+        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        versions=versions(),
+        identity=identity,
+        provenance=provenance or stated_provenance(file) or str(file),
+        place=place_of(sequence) if reference.knows_frames else "",
+        stamps_match=reference.knows_frames and not coverage.n_without_frame,
+        notes=notes,
+    ).normalised()
+
+    # trajectory, stamps and ground truth into the store
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    store.prepare()
+    with store.work_folder(record.run_id) as work:
+        comment = f"imported: {tracker} on {reference.part.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, reference.timestamps_ns, reference.ground_truth)
+        store.publish(work, record)
+    return record
+
+
+def _identity_of_import(
+    file: Path,
+    tracker: str,
+    which: Which,
+    part: Part,
+    timestamps: str | Path | None,
+    topic: str | None,
+) -> dict[str, Any]:
+    """Identity of an imported trajectory: its file, and the frames that it belongs to.
+
+    Args:
+        file: The trajectory; its content counts, not its name.
+        tracker: Name of the system that made it.
+        which: Which trajectory of the system it is.
+        part: The part of the sequence that it was made on.
+        timestamps: File of the stamps where the format has none; its content counts.
+        topic: The topic that was taken of a bag.
+    """
     identity = {
         "kind": "imported",
         "tracker": tracker,
@@ -445,40 +492,7 @@ def import_trajectory(
         identity["timestamps"] = digest_of(Path(timestamps).expanduser())
     if topic is not None:
         identity["topic"] = topic
-    # its record, as that of a run: frames without a pose count as lost
-    record = RunRecord(
-        kind="imported",
-        run_id=run_id_of(identity),
-        status=status,
-        reason=reason,
-        tracker=TrackerInfo(
-            id=tracker, label=label or f"{tracker} (imported)", provenance="external"
-        ),
-        sequence=reference.info(part_digest(identity)),
-        frames=None if frames is None else parse_frames(frames),
-        stride=stride,
-        n_frames=total,
-        n_tracked=covered,
-        n_lost=total - covered,
-        coverage=covered / total if reference.knows_frames else None,
-        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
-        versions=versions(),
-        identity=identity,
-        provenance=provenance or stated_provenance(file) or str(file),
-        place=place_of(sequence) if reference.knows_frames else "",
-        stamps_match=reference.knows_frames and not coverage.n_without_frame,
-        notes=notes,
-    ).normalised()
-
-    # trajectory, stamps and ground truth into the store
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    store.prepare()
-    with store.work_folder(record.run_id) as work:
-        comment = f"imported: {tracker} on {part.id}"
-        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
-        store.add_sequence(record.sequence.part, reference.timestamps_ns, reference.ground_truth)
-        store.publish(work, record)
-    return record
+    return identity
 
 
 @dataclass(frozen=True, eq=False)
@@ -578,6 +592,43 @@ class _Coverage(NamedTuple):
     def of_all(cls, poses: int, n_without_frame: int) -> _Coverage:
         """Each pose counts as a frame: the frames are not known."""
         return cls(poses, poses, n_without_frame, poses - 1)
+
+
+def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Coverage:
+    """Coverage of the reference's frames by a trajectory; each pose is a frame where the frames are not known.
+
+    Args:
+        trajectory: The trajectory.
+        reference: What it is compared with.
+        file: Its file, for the error.
+
+    Raises:
+        RunError: Fewer than two poses are near a frame.
+    """
+    stamps_s = to_seconds(reference.timestamps_ns)
+    coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{reference.part.id}'")
+    if reference.knows_frames:
+        return coverage
+    return _Coverage.of_all(len(trajectory), coverage.n_without_frame)
+
+
+def _coverage_notes(coverage: _Coverage, reference: _Reference, *, poses: int) -> list[str]:
+    """Notes for the record on what is not known of the coverage, and on poses beside the frames.
+
+    Args:
+        coverage: The coverage.
+        reference: The sequence, by its images or by a ground truth alone.
+        poses: Poses of the trajectory.
+    """
+    if not reference.knows_frames:
+        return [
+            "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
+        ]
+    if coverage.n_without_frame:
+        return [
+            f"{coverage.n_without_frame} of {poses} poses carry stamps that are no input frame's"
+        ]
+    return []
 
 
 def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> _Coverage:
