@@ -69,7 +69,9 @@ class Canvas:
 
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
+        # estimated centres [N, 3] in the first camera's frame, cut where the tracker was lost
         centres, pieces, ate_m = align_to_truth(episode, self._truth)
+        # image and plot side by side, the line of numbers below
         plot = self._plot(centres @ VIEWS[self._view].T, pieces, episode.outcomes[-1].index)
         body = np.concatenate([self.picture(frame, result), plot], axis=1)
         return np.concatenate([body, self._strip(result, episode, ate_m, body.shape[1])], axis=0)

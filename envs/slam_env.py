@@ -109,8 +109,9 @@ class EpisodeState:
     """A copy of an episode in its middle, made by `SlamEnv.clone_state`; it can be restored any number of times.
 
     Attributes:
-        origin: What it is of: sequence, tracker, control, settings and version of this package.
-        parts: The copied attributes.
+        origin: Description by name of everything that it depends on: sequence, tracker, control,
+            settings, reward, protocol, `lost_after` and version of this package.
+        parts: Copies of the environment's attributes that belong to the episode, by name.
     """
 
     origin: Mapping[str, str]
@@ -191,11 +192,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
-    """An environment's own has the frame rate of its sequence, stride included."""
+    """Each environment has its own, with the frame rate of its sequence, stride included."""
     sequence: FrameSequence
     """The frames of the episode."""
     window: tuple[int, int]
-    """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
+    """The episode's frames in the sequence as it was opened: the first, and one past the last."""
 
     @names_wrong_arguments
     def __init__(
@@ -224,6 +225,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         given = {
             name: value for name, value in locals().items() if name not in ("self", "__class__")
         }
+        # EzPickle keeps the arguments: unpickling makes the environment again
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
         if render_mode not in (None, "rgb_array"):
             raise SettingsError(f"unknown render mode '{render_mode}'", "choose rgb_array")
@@ -258,12 +260,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             stride=stride,
             memory_map=memory_map,
         )
+        # a text stays one: `ActionMap` refuses it by what the user wrote, not by its letters
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
 
         # what options of `reset` replace, and the spaces that follow from it
         self._use_settings(settings)
         self._use_sequence(sequence)
+        # fail here where no masks are available, not at frame 0
         segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
         self.observation_space = observation_space(observation, self.sequence.camera)
@@ -778,7 +782,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
 
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
-    """View of a sequence's frames from ``window[0]`` up to, without, ``window[1]``; the whole is returned as it is."""
+    """The frames ``window[0]`` to ``window[1] - 1`` of a sequence, as a view."""
     if window == (0, len(whole)):
         return whole
     return cast("FrameSequence", SequenceView(whole, *window))
