@@ -222,6 +222,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         fixed_info: bool = False,
         memory_map: bool = False,
     ) -> None:
+        # keep the arguments: pickling makes the environment again from them
         given = {
             name: value for name, value in locals().items() if name not in ("self", "__class__")
         }
@@ -243,16 +244,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._parts = observation_parts(observation)
+        self._observation_parts = observation_parts(observation)
         self._observation = observation
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
-        self._length = window
+        self._window_length = window
         self._fixed_info = fixed_info
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
-        self._open = partial(
+        self._open_sequence = partial(
             open_frames,
             data_root=data_root,
             camera=camera,
@@ -476,7 +477,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.close()
         self._canvas = None
         vars(self).update(parts)
-        self.sequence = _part(self._whole, self.window)
+        self.sequence = _frames_of_window(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
         """Description of everything an episode's state depends on; equal where the state can be restored."""
@@ -606,13 +607,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     @names_wrong_arguments
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
         """Open a sequence and check that tracker, protocol and window fit it."""
-        opened = self._open(sequence, preprocessing=preprocessing_of(self.settings))
+        opened = self._open_sequence(sequence, preprocessing=preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
-        if self._length is not None and self._length > len(opened):
+        if self._window_length is not None and self._window_length > len(opened):
             raise SettingsError(
-                f"a window of {self._length} frames is longer than '{opened.id}', which has {len(opened)} here",
+                f"a window of {self._window_length} frames is longer than '{opened.id}', which has {len(opened)} here",
                 f"give window={len(opened)} or less",
             )
         self.sequence = self._whole = opened
@@ -642,7 +643,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._use_sequence(options["sequence"])
             size = (camera.width, camera.height)
             new_size = (self.sequence.camera.width, self.sequence.camera.height)
-            if {"rgb", "depth"} & set(self._parts) and size != new_size:
+            if {"rgb", "depth"} & set(self._observation_parts) and size != new_size:
                 raise SequenceError(
                     f"images of {new_size} pixels do not fit the observation space of {size}"
                 )
@@ -651,14 +652,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         window = (0, len(self._whole))
         if options.get("window") is not None:
             window = parse_window(options["window"], self._whole)
-        elif self._length is not None:
-            first = int(self.np_random.integers(window[1] - self._length + 1))
-            window = (first, first + self._length)
+        elif self._window_length is not None:
+            first = int(self.np_random.integers(window[1] - self._window_length + 1))
+            window = (first, first + self._window_length)
         if window != self.window:
             if self._whole.masks is not None:
                 # the tracker may hold the exact masks, which are numbered as the frames
                 self.close()
-            self.sequence = _part(self._whole, window)
+            self.sequence = _frames_of_window(self._whole, window)
             self.window = window
 
     def _build_or_reuse_tracker(self) -> Tracker:
@@ -770,7 +771,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _observe(self) -> Any:
         """The observation of the last tracked frame: the vector for ``stats``, else a dict of parts."""
         progress = self.episode.outcomes[-1].index / max(self._n_frames - 1, 1)
-        observed = observe(self._parts, self.frame, self.result, self.episode, progress)
+        observed = observe(self._observation_parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 
     def _info(self) -> dict[str, Any]:
@@ -781,7 +782,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return fixed_info(info, self.protocol) if self._fixed_info else info
 
 
-def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
+def _frames_of_window(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames ``window[0]`` to ``window[1] - 1`` of a sequence, as a view."""
     if window == (0, len(whole)):
         return whole

@@ -32,6 +32,7 @@ from dynslam_bench.reports.html.page import (
 from dynslam_bench.reports.html.run_pages import (
     RUN_PAGE,
     SHARE_EDGES,
+    LeastError,
     RunPage,
     error_by_share,
     write_run_pages,
@@ -39,6 +40,7 @@ from dynslam_bench.reports.html.run_pages import (
 from dynslam_bench.reports.model.answers import (
     MEANINGS,
     answers,
+    cell_error_m,
     error_columns,
     limits,
 )
@@ -183,6 +185,7 @@ def build_report(
     rank_seen: bool = False,
     trials: bool = False,
     most_pages: int | None = None,
+    most_pictures: int | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = no_progress,
@@ -206,6 +209,8 @@ def build_report(
             counted.
         most_pages: Runs that have a page of their own, typical ones of their cells first; None for
             `pages_for`.
+        most_pictures: Runs whose page has pictures, typical ones first; None for all failures and
+            typical runs. Without pictures a page has the track and the curves.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -231,8 +236,14 @@ def build_report(
         typical = board.typical
         paged = _choose_paged(board, typical, most_pages)
         paged_ids = {row.run_id for row in paged}
-        pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
-        run_pages = write_run_pages(paged, pictured, protocol, output, pool, on_page)
+        shown = [row for row in paged if row.failed or row.run_id in typical]
+        if most_pictures is not None:
+            # typical runs first
+            shown.sort(key=lambda row: row.run_id not in typical)
+            shown = shown[:most_pictures]
+        pictured = {row.run_id for row in shown}
+        least = _least_errors(board)
+        run_pages = write_run_pages(paged, pictured, protocol, output, least, pool, on_page)
 
     # put the tables and figures together
     on_progress(0, None, "putting the tables and figures together")
@@ -272,6 +283,24 @@ def build_report(
     write_side(output, "board", board_data(board, boards, protocol, paged_ids, pictured, pageless))
     write_side(output, "ratios", ratios_data(board))
     return _write(content, output)
+
+
+def _least_errors(board: Board) -> dict[str, LeastError]:
+    """The least median error of a ranked tracker on every sequence, by `RunRow.column_id`."""
+    least: dict[str, LeastError] = {}
+    for row in board.rows:
+        name = board.sequence(row)
+        if row.column_id in least:
+            continue
+        errors = []
+        for key in board.ranked:
+            cell = board.cells[key].get(name)
+            error_m = None if cell is None else cell_error_m(cell)
+            if error_m is not None:
+                errors.append((error_m, board.labels[key]))
+        if errors:
+            least[row.column_id] = LeastError(*min(errors))
+    return least
 
 
 def _monocular_boards(loaded: Loaded, boards: Mapping[str, Board]) -> dict[str, Board]:
@@ -333,7 +362,7 @@ def _pageless_note(pages: int, runs: int) -> str:
     if pages == runs:
         return ""
     return (
-        f"{runs - pages} of {runs} runs have no pictures and no course over time here: {pages} have, those with the "
+        f"{runs - pages} of {runs} runs have no track and no curves here: {pages} have, those with the "
         f"median error of their cell first. report --most-pages {runs} shows all. The tables count all runs."
     )
 
@@ -456,6 +485,7 @@ def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
     charts = {"speed": figures.speed_figure(board)}
     for number, part in enumerate(boards.values()):
         charts[f"errors-{number}"] = figures.error_figure(part)
+        charts[f"below-{number}"] = figures.cumulative_figure(part)
     return render(
         "board.html.j2",
         title=content.title,
@@ -870,6 +900,7 @@ def publish(
     note: str = "",
     protocol: Protocol | str = "tum-rgbd/v1",
     most_pages: int | None = None,
+    most_pictures: int | None = None,
     on_progress: OnProgress = no_progress,
 ) -> Site:
     """Make the report of some results folders, take the pages of studies beside it, and write a first page for all.
@@ -885,8 +916,9 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
-        most_pages: Runs that have a page of their own, see `build_report`; the pictures of a run
-            take about 0.4 MB.
+        most_pages: Runs that have a page of their own, see `build_report`; a page takes about 30 kB.
+        most_pictures: Runs whose pictures are shown, see `build_report`; the pictures of a run take
+            about 0.4 MB.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
@@ -910,6 +942,7 @@ def publish(
         title=title,
         command="dynslam-bench report RESULTS",
         most_pages=most_pages,
+        most_pictures=most_pictures,
         on_progress=on_progress,
     )
     # the rows are for work with the results, not for looking at them

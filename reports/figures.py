@@ -43,6 +43,8 @@ DASHES = ("solid", "dash", "dot", "dashdot")
 """Styles of trackers' lines."""
 NEUTRAL = "#8a8a8a"
 """Colour of axes, guides and true paths."""
+_FEWEST_IN_CURVE = 4
+"""Sequences below which a curve over them says no more than the points do."""
 MOST_POINTS = 400
 """Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 
@@ -130,6 +132,13 @@ def figure_of(traces: Sequence[Any], height: int, **layout: Any) -> go.Figure | 
 def log_axis(title: str) -> dict[str, Any]:
     """A logarithmic axis; plotly chooses its labels."""
     return {"type": "log", "title": title, "minexponent": 5}
+
+
+def mm_axis(title: str) -> dict[str, Any]:
+    """A logarithmic axis of errors in millimetres, with labels at 1, 2, 5, 10 and so on, written in full."""
+    labels = [f * 10.0**power for power in range(-3, 6) for f in (1, 2, 5)]
+    texts = [f"{value:g}" for value in labels]
+    return log_axis(title) | {"tickmode": "array", "tickvals": labels, "ticktext": texts}
 
 
 GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"}, "layer": "below"}
@@ -230,7 +239,7 @@ def error_figure(board: Board) -> go.Figure | None:
         traces,
         110 + 30 * len(lines),
         showlegend=False,
-        xaxis=log_axis("absolute trajectory error (mm), left is better"),
+        xaxis=mm_axis("absolute trajectory error (mm), left is better"),
         # below the last tracker there is room for the label of the static camera
         yaxis={
             "categoryorder": "array",
@@ -315,6 +324,50 @@ def _add_static_camera(figure: go.Figure, static_mm: float, first_line: list[str
     )
 
 
+def cumulative_figure(board: Board) -> go.Figure | None:
+    """The share of sequences with an error below that of the axis, a line a tracker; None without two sequences.
+
+    As the ETH3D benchmark draws it (Schops et al. 2019). A sequence without a number, since all runs failed or
+    there were none, is below no error.
+    """
+    names = board.common or board.sequences
+    if len(names) < _FEWEST_IN_CURVE:
+        return None
+    look = looks(board)
+    errors_mm: dict[str, list[float]] = {}
+    for key in [*board.trackers, *board.final_only]:
+        of_sequence = board.cells[key]
+        cells = [of_sequence[name] for name in names if name in of_sequence]
+        measured = [1000.0 * error for cell in cells if (error := cell_error_m(cell))]
+        if measured:
+            errors_mm[key] = sorted(measured)
+    if not errors_mm:
+        return None
+
+    # each curve begins at no sequence and goes on to the largest error of all
+    largest_mm = max(values[-1] for values in errors_mm.values())
+    traces = []
+    for key, values in errors_mm.items():
+        shares = [100.0 * (at + 1) / len(names) for at in range(len(values))]
+        traces.append(
+            go.Scatter(
+                x=rounded([values[0], *values, largest_mm]),
+                y=rounded([0.0, *shares, shares[-1]]),
+                mode="lines",
+                name=wrapped(board.names[key]),
+                line={"color": look[key]["color"], "dash": look[key]["dash"], "shape": "hv"},
+                hovertemplate="%{y:.0f} % below %{x:.4g} mm<extra>%{fullData.name}</extra>",
+            )
+        )
+    return figure_of(
+        traces,
+        max(340, 110 + 30 * len(traces)),
+        showlegend=True,
+        xaxis=mm_axis("absolute trajectory error (mm)"),
+        yaxis={"title": "sequences below it (%)", "range": [0, 103]},
+    )
+
+
 def _pareto_front(points: Collection[tuple[float, float]]) -> list[tuple[float, float]]:
     """Points (speed, ratio) that no other point beats in both, the slowest first."""
     front = []
@@ -368,7 +421,7 @@ def mask_figure(board: Board) -> go.Figure | None:
         max(420, 110 + 21 * len(traces)),
         showlegend=True,
         xaxis=overlap,
-        yaxis=log_axis("ATE (mm)"),
+        yaxis=mm_axis("ATE (mm)"),
     )
 
 
@@ -399,7 +452,7 @@ def share_figure(
         if any(error_mm is not None for error_mm, _ in bins.get(key, []))
     ]
     shares = {"title": "share of the image that shows people (%)", "type": "category"}
-    errors = log_axis("frame-to-frame error, RMSE (mm)")
+    errors = mm_axis("frame-to-frame error, RMSE (mm)")
     return figure_of(
         traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors
     )

@@ -80,7 +80,7 @@ class Configuration(NamedTuple):
     settings: Mapping[str, Any]
 
 
-FOREIGN = "transfer"
+EXTERNAL_STAGE = "transfer"
 """Stage that only trackers in another program have."""
 
 
@@ -124,7 +124,7 @@ def outcome(
 
     # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
-    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
+    elsewhere = record.device.startswith("cuda") or EXTERNAL_STAGE in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
     period_s = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     return Outcome(
@@ -553,6 +553,19 @@ def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     return {
         place: [math.log(max(errors[instance], FLOOR_M)) for instance in group]
         for place, group in groups
+    }
+
+
+def scene_errors_m(outcomes: Outcomes) -> dict[str, float]:
+    """ATE in metres in each scene: the median over the starts at each place, the geometric mean over its places.
+
+    The quotient of two configurations that ran from the same starts is their ratio by `by_scene`.
+    """
+    errors = {instance: run.ate_m for instance, run in outcomes.items()}
+    medians = {place: float(np.median(logs)) for place, logs in log_errors(errors).items()}
+    return {
+        scene: math.exp(fmean(medians[place] for place in places))
+        for scene, places in scenes(medians).items()
     }
 
 

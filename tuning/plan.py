@@ -45,7 +45,7 @@ from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.families import same_path
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
-from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.sequences.view import SequencePart, sequence_part_of
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.objectives import (
     Configuration,
@@ -353,7 +353,7 @@ class Plan:
             StudyError: It names what has changed.
         """
         run = resolve(self.run_spec(self.design.tune[0], self.baseline))
-        changed = LookUp(self.store).changed(run) if run.foreign else ""
+        changed = LookUp(self.store).changed(run) if run.has_plugins_or_programs else ""
         if changed:
             raise StudyError(
                 f"study '{self.spec.name}': {changed} has changed since the baseline ran",
@@ -573,7 +573,7 @@ def check_splits(
         _check_repeats(instances, opened, apart=set(splits.get("confirm", ())))
 
     # content: no sequence of one split may be one of the other
-    scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
+    scenes_of = {name: sequence_part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
@@ -594,7 +594,7 @@ def _check_copies(study: str, names: Iterable[str], opened: Mapping[str, Any]) -
     """Refuse one recording under several names within a split: it would count as several scenes."""
     recorded = [name for name in names if not hasattr(opened[name], "scene_digest")]
     for one, other in combinations(recorded, 2):
-        if part_of(opened[one]).scene == part_of(opened[other]).scene:
+        if sequence_part_of(opened[one]).scene == sequence_part_of(opened[other]).scene:
             continue
         if same_recording(opened[one], opened[other]):
             raise StudyError(
@@ -616,12 +616,12 @@ def _check_repeats(
     Raises:
         StudyError: Two share frames, or an instance is named twice.
     """
-    parts: dict[ProblemInstance, Part] = {}
+    parts: dict[ProblemInstance, SequencePart] = {}
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
         cut = cast("Any", instance.cut(opened[instance.sequence]))
-        parts[instance] = part_of(cut, instance.offset)
+        parts[instance] = sequence_part_of(cut, instance.offset)
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue
@@ -637,7 +637,7 @@ def _check_repeats(
             )
 
 
-def _images(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
+def _images(instance: ProblemInstance, part: SequencePart) -> tuple[object, ...]:
     """Key of the images that a tracker sees, and of the random numbers that it draws, within a scene."""
     return part.block, part.noise, instance.offset, instance.degradation, instance.seed
 

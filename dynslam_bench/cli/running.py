@@ -53,8 +53,8 @@ def run(
     ],
     seed: opts.Seeds = None,
     offset: opts.Offsets = None,
-    assignments: opts.Assignments = None,
-    settings: opts.SettingsFile = None,
+    set_options: opts.Assignments = None,
+    settings_file: opts.SettingsFile = None,
     preset: Annotated[
         Optional[str],
         typer.Option(
@@ -178,10 +178,10 @@ def run(
     as_json: opts.AsJson = False,
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
-    from dynslam_bench.api import checked, make_specs, run_specs
+    from dynslam_bench.api import make_specs, run_specs, validated_record
 
     # settings: --settings below --set, and the two options that stand for settings above both
-    overrides = opts.gather_settings(assignments, settings)
+    overrides = opts.gather_settings(set_options, settings_file)
     if start_map is not None:
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
@@ -210,7 +210,7 @@ def run(
         save_map=save_map,
         label=label,
         degrade=opts.gather_settings(degrade),
-        limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
+        limits=validated_record(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )
     # made, then shown with their errors
     scored_under = protocol or default_protocol(tracker)

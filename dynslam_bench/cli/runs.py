@@ -553,7 +553,9 @@ def recording_note(
 
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
-        if sequence.startswith("synthetic/") or not (row["status"] != "ok" or _is_no_better(row)):
+        if sequence.startswith("synthetic/") or not (
+            row["status"] != "ok" or _is_no_better_than_static(row)
+        ):
             continue
         # the first such recording alone: each check takes seconds
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)
@@ -566,9 +568,9 @@ def recording_note(
     return ""
 
 
-def _is_no_better(row: Mapping[str, Any]) -> bool:
+def _is_no_better_than_static(row: Mapping[str, Any]) -> bool:
     """Whether a tracker that is to follow a moving camera was no better than a static camera."""
-    # where the camera stands still, no tracker can be better
+    # `false_motion_max_m` is measured before a fixed camera only, where a static camera has no error
     error = row["ate_rmse_m"]
     bound = row["static_camera_ate_rmse_m"]
     if row["tracker"] == "never-move" or row["false_motion_max_m"] is not None:

@@ -150,10 +150,16 @@ class FilterResult:
         stats: Mapping[str, float] | None = None,
         mask: NDArray[np.bool_] | None = None,
     ) -> FilterResult:
-        """A verdict with weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``."""
-        verdict = np.asarray(keep, dtype=bool)
-        counts = {"dropped": float(np.count_nonzero(~verdict)), **(stats or {})}
-        return cls(verdict, verdict.astype(np.float32), counts, mask)
+        """From a keep mask ``[N]``: weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``.
+
+        Args:
+            keep: bool ``[N]``.
+            stats: Further counts.
+            mask: bool ``[H, W]``, see the class.
+        """
+        kept = np.asarray(keep, dtype=bool)
+        counts = {"dropped": float(np.count_nonzero(~kept)), **(stats or {})}
+        return cls(kept, kept.astype(np.float32), counts, mask)
 
 
 @runtime_checkable

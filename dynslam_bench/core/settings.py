@@ -171,7 +171,7 @@ def names(
     return Field(default, description=meaning, json_schema_extra=extra)
 
 
-def named(settings: Settings) -> dict[str, tuple[str, str]]:
+def references_of(settings: Settings) -> dict[str, tuple[str, str]]:
     """What the settings name: dotted name to ``(kind, value)``, see `names`; fields that name nothing are left out.
 
     A field of type `Path` counts as a file, too.

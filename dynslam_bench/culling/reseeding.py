@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.fast import EDGE
 from dynslam_bench.features.orb import cell_side, level_quotas, spread
@@ -14,7 +14,7 @@ ORIGIN = EDGE - 3
 """Where the extractor's cells begin, in pixels of a level."""
 
 
-class ReseedingFilter(Rule[ReseedingSettings]):
+class ReseedingFilter(BaseFilter[ReseedingSettings]):
     """Uses the best `budget` of the features that earlier filters kept.
 
     The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.ordering import counting_sort
 from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
@@ -207,7 +208,6 @@ def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]
     return list(map(int, quotas))
 
 
-@kernel
 def spread(
     cells: NDArray[np.int64], response: NDArray[np.int16], allowed: NDArray[np.bool_], quota: int
 ) -> NDArray[np.int64]:
@@ -226,29 +226,25 @@ def spread(
     index = np.flatnonzero(allowed)
     if len(index) == 0:
         return index
-    # the strongest first; a point's rank is the number of stronger ones in its cell
-    index = index[_stable_order(-response[index])]
-    taken = np.zeros(cells.max() + 1, np.int64)
-    rank = np.empty(len(index), np.int64)
-    for i, cell in enumerate(cells[index]):
-        rank[i] = taken[cell]
-        taken[cell] += 1
-    return index[_stable_order(rank)][: max(quota, 0)]
+    # the strongest first
+    weakness = response.max() - response[index].astype(np.int64)
+    _, order = counting_sort(weakness, int(weakness.max()) + 1)
+    index = index[order]
+    # a point's rank is the number of stronger ones in its cell
+    rank = _occurrences_before(cells[index], int(cells.max()) + 1)
+    _, order = counting_sort(rank, int(rank.max()) + 1)
+    return index[order[: max(quota, 0)]]
 
 
 @kernel
-def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
-    """Indices that sort integers of a small range, by counting; equal ones keep their order."""
-    lowest = keys.min()
-    start = np.zeros(keys.max() - lowest + 2, np.int64)
-    order = np.empty(len(keys), np.int64)
-    for key in keys:
-        start[key - lowest + 1] += 1
-    start = np.cumsum(start)
-    for i, key in enumerate(keys):
-        order[start[key - lowest]] = i
-        start[key - lowest] += 1
-    return order
+def _occurrences_before(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """How often each of the numbers ``[N]``, from 0 to `count` - 1, occurs before it."""
+    occurred = np.zeros(count, np.int64)
+    before = np.empty(len(numbers), np.int64)
+    for i in range(len(numbers)):
+        before[i] = occurred[numbers[i]]
+        occurred[numbers[i]] += 1
+    return before
 
 
 @kernel

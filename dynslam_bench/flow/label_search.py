@@ -362,7 +362,7 @@ def run_phase(
                 count = finite_labels(candidates[i], trials)
                 if phase == 0 and rules.moth_flame:
                     placed = min(count, population, end - used)
-                    moths[:placed] = trials[:placed]
+                    copy_labels(trials, moths, placed)
             elif stage == INITIAL:
                 random = place_moths(moths, placed, lower, upper, trials, random)
                 count = population - placed
@@ -402,9 +402,18 @@ def run_phase(
                 # the best N of X and its opposites
                 for m in range(population):
                     if costs[m] < ceiling:
-                        moths[m] = flames[m]
+                        for j in range(4):
+                            moths[m, j] = flames[m, j]
                 stage = SEARCH
         state.used[i] = used
+
+
+@inlined
+def copy_labels(source: Floats, target: Floats, count: int) -> None:
+    """Copy the first `count` labels."""
+    for m in range(count):
+        for j in range(4):
+            target[m, j] = source[m, j]
 
 
 @inlined

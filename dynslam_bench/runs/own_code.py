@@ -13,7 +13,7 @@ from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
 from dynslam_bench.core.plugins import Registry
 from dynslam_bench.core.plugins import used as used_plugins
-from dynslam_bench.core.reads import Anchors
+from dynslam_bench.core.reads import BaseFolders
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
@@ -23,14 +23,17 @@ from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.sequences.view import reader_of
 from dynslam_bench.trackers.registry import TRACKERS
-from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings, parts_of
+from dynslam_bench.trackers.systems.composition import (
+    UnfilteredSystemSettings,
+    component_entry_points,
+)
 
-ENVIRONMENT = ("envs.slam_env", "runs.loop")
+ENVIRONMENT_MODULES = ("envs.slam_env", "runs.loop")
 DEGRADED_FRAMES = "envs.wrappers"
 """Needed by runs with degraded or dropped frames alone."""
-FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
+REGISTRY_MODULES = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
-BESIDE_THE_LOOP = (
+RESULT_NEUTRAL_MODULES = (
     "envs.rendering",
     "envs.wrappers",
     "runs.artifacts",
@@ -43,7 +46,7 @@ BESIDE_THE_LOOP = (
     "sequences.decoded",
 )
 """What the environment and the loop use to draw and to store; masks count with the systems that have them."""
-WITH_PLUGINS = (
+PACKAGES_FOR_PLUGINS = (
     "contracts",
     "core",
     "culling",
@@ -61,12 +64,12 @@ WITH_PLUGINS = (
 
 
 ALWAYS_USED = "the environment"
-"""Stands among the parts of a run for the environment with the run's loop."""
+"""Stands among the components of a run for the environment with the run's loop."""
 PLUGINS = "what plug-ins may use"
-"""Stands among the parts of a run with plug-ins for the packages `WITH_PLUGINS`."""
+"""Stands among the components of a run with plug-ins for the packages `PACKAGES_FOR_PLUGINS`."""
 
 
-def parts_of_run(
+def components_of_run(
     tracker: TrackerSpec,
     settings: Settings,
     source: str,
@@ -75,6 +78,8 @@ def parts_of_run(
     changes_frames: bool,
 ) -> list[str]:
     """What a run is made of beside the environment: entry points, and modules of the sequence, sorted.
+
+    An identity stores them as ``parts``.
 
     Args:
         tracker: The tracker.
@@ -90,42 +95,42 @@ def parts_of_run(
     return sorted(parts)
 
 
-def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, list[str]]:
+def modules_by_component(graph: ModuleGraph, parts: Collection[str]) -> dict[str, list[str]]:
     """The modules of this package that decide a run's result, by the part of the run that uses them.
 
     Args:
         graph: The package's modules.
-        parts: See `parts_of_run`.
+        parts: See `components_of_run`.
 
     Returns:
         The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a
-        part is foreign.
+        part lies outside this package.
     """
     # what decides no result, and what only looks up the others
-    never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
+    never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in REGISTRY_MODULES)]
     # each part brings what it imports
-    environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
-    beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
+    environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT_MODULES]
+    beside_the_loop = [f"{PACKAGE}.{name}" for name in RESULT_NEUTRAL_MODULES]
     modules = {ALWAYS_USED: graph.closure(environment, [*never, *beside_the_loop])}
     for part in parts:
         modules[part] = graph.closure([module_of(part)], never)
     # what a plug-in imports is known only while it runs: all that it may
-    if any(map(is_foreign, parts)):
+    if any(map(is_outside_package, parts)):
         modules[PLUGINS] = sorted(modules_for_plugins(graph))
     return modules
 
 
 def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
-    """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
+    """The modules of this package that decide a run's result, sorted; see `modules_by_component`."""
     used: set[str] = set()
-    for modules in modules_by_part(graph, parts).values():
+    for modules in modules_by_component(graph, parts).values():
         used.update(modules)
     return sorted(used)
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
     """The modules of all packages that a plug-in may use."""
-    packages = tuple(f"{PACKAGE}.{name}." for name in WITH_PLUGINS)
+    packages = tuple(f"{PACKAGE}.{name}." for name in PACKAGES_FOR_PLUGINS)
     return [module for module in graph.modules if f"{module}.".startswith(packages)]
 
 
@@ -170,7 +175,7 @@ def entry_points_of(tracker: TrackerSpec, settings: Settings, source: str) -> It
     # the tracker itself, then its parts
     yield tracker.entry_point
     if isinstance(settings, UnfilteredSystemSettings):
-        yield from parts_of(settings)
+        yield from component_entry_points(settings)
     for group in groups_of(settings):
         if isinstance(group, FeatureSettings):
             yield FEATURES.get(group.extractor).entry_point
@@ -194,7 +199,7 @@ def segmenter_of(source: str) -> str:
     return argument if kind == "plugin" else kind
 
 
-def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
+def base_folders_of(tracker: TrackerSpec, parts: Iterable[str]) -> BaseFolders:
     """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
 
     A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the
@@ -202,7 +207,7 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
 
     Args:
         tracker: The tracker.
-        parts: See `parts_of_run`.
+        parts: See `components_of_run`.
     """
     # files of plug-ins: the tracker's, else those of the parts
     if is_file(tracker.entry_point):
@@ -210,15 +215,15 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
     else:
         files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if not files:
-        return Anchors(plugin=None, work=Path.cwd())
+        return BaseFolders(plugin=None, work=Path.cwd())
     # one folder stands for all, and the same one on every machine
     first = min(files, key=lambda file: (file.name, file))
-    return Anchors(plugin=first.parent, work=Path.cwd())
+    return BaseFolders(plugin=first.parent, work=Path.cwd())
 
 
-def named_part(part: str, anchors: Anchors) -> str:
+def portable_name(part: str, base_folders: BaseFolders) -> str:
     """An entry point as it stands in identities: equal wherever the folder of its file lies."""
-    return anchors.name(str(Path(part).absolute())) if is_file(part) else part
+    return base_folders.name(str(Path(part).absolute())) if is_file(part) else part
 
 
 def is_file(part: str) -> bool:
@@ -226,6 +231,6 @@ def is_file(part: str) -> bool:
     return module_of(part).endswith(".py")
 
 
-def is_foreign(part: str) -> bool:
+def is_outside_package(part: str) -> bool:
     """Whether a part of a run lies outside this package."""
     return is_file(part) or module_of(part).partition(".")[0] != PACKAGE

@@ -49,7 +49,7 @@ LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
 
 
-def asked_digest(identity: Mapping[str, Any]) -> str:
+def digest_of_request(identity: Mapping[str, Any]) -> str:
     """The first twelve digits of a run's id: what was asked for."""
     return digest({name: identity[name] for name in ASKED if name in identity}, 12)
 
@@ -58,7 +58,7 @@ def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
     # all that was not asked for was read
     read = {name: value for name, value in identity.items() if name not in ASKED}
-    return asked_digest(identity) + digest(read, 8)
+    return digest_of_request(identity) + digest(read, 8)
 
 
 def coverage_text(coverage: float | None) -> str:
@@ -333,7 +333,7 @@ class RunRecord(Record):
         return self.model_copy(update={"command": [], "place": "", "tracker": tracker})
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def requested_settings(self) -> dict[str, Any]:
         """The settings that were asked for; in place of a map's path the digest of its content, as ``map``.
 
         Values are those that the run had, however they were spelled: ``"1"`` and ``1.0`` are one.
@@ -354,7 +354,7 @@ class RunRecord(Record):
     @property
     def trial_of(self) -> str:
         """The study that made it with settings of its own; empty for its runs with the default settings, and others."""
-        return self.study if self.asked else ""
+        return self.study if self.requested_settings else ""
 
     @property
     def repeat(self) -> str:

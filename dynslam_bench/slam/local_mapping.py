@@ -503,19 +503,20 @@ def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
 def _triangulate(
     view_a: View, view_b: View, scales: Array, camera: Intrinsics, sigmas: float
 ) -> tuple[Slots, Slots, Array]:
-    """Triangulate features of two views that match along epipolar lines; each is used once.
+    """Triangulate free features of two views that match along epipolar lines.
 
     Args:
-        view_a: The new keyframe: pose, features, and which of them observe no point yet.
-        view_b: A neighbour of it.
+        view_a: The new keyframe, with N features that observe no point yet.
+        view_b: A neighbour of it, with M such features.
         scales: Scale of each octave of the image pyramid, 1 for the finest.
         camera: Intrinsics without distortion, pixels.
         sigmas: Least angle between two rays for a triangulation by both, in standard deviations of
             a feature's position.
 
     Returns:
-        Features of `view_a` ``[M]`` and of `view_b` ``[M]`` that fit one point, and the point's
-        depth in `view_a` ``[M]``, metres with depth.
+        Positions in `free`: for each free feature of `view_b` the one of `view_a` whose best match
+        it is, ``[M]``, -1 without; for each of `view_a` its best match ``[N]``, -1 without, and the
+        point's depth in `view_a` ``[N]``, metres with depth.
     """
     r, t = _relative_pose(view_a.pose, view_b.pose)
     n = view_a.free.shape[0]
@@ -524,8 +525,11 @@ def _triangulate(
     depth = np.zeros(n)
     best_distance = np.full(n, FAR, np.int64)
     # rays of b's features, (bx, by, 1)
-    bx = (view_b.xy[view_b.free, 0] - camera.cx) / camera.fx
-    by = (view_b.xy[view_b.free, 1] - camera.cy) / camera.fy
+    bx = np.empty(m)
+    by = np.empty(m)
+    for j in range(m):
+        bx[j] = (view_b.xy[view_b.free[j], 0] - camera.cx) / camera.fx
+        by[j] = (view_b.xy[view_b.free[j], 1] - camera.cy) / camera.fy
     cosine_limit = np.cos(MIN_PARALLAX)
     focal = 0.5 * (camera.fx + camera.fy)
     for i in range(n):
@@ -612,8 +616,7 @@ def _triangulate(
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
-    chosen = np.sort(matched_by[matched_by >= 0])
-    return view_a.free[chosen], view_b.free[match[chosen]], depth[chosen]
+    return matched_by, match, depth
 
 
 def triangulate(
@@ -633,14 +636,19 @@ def triangulate(
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    features, other_features, depth = _triangulate(
-        _view(slam_map, slot),
-        _view(slam_map, other),
+    view = _view(slam_map, slot)
+    other_view = _view(slam_map, other)
+    matched_by, match, depth = _triangulate(
+        view,
+        other_view,
         slam_map.scales,
         intrinsics_of(slam_map.camera),
         float(min_parallax_sigmas),
     )
-    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth)
+    chosen = np.sort(matched_by[matched_by >= 0])
+    features = view.free[chosen]
+    other_features = other_view.free[match[chosen]]
+    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth[chosen])
     position = se3.transform(se3.inverse(slam_map.kf_pose[slot]), local)
     return features, other_features, position
 

@@ -465,17 +465,18 @@ class Map:
         """
         # with a single level any factor gives octave 0
         scale_factor = float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2
+        count, index, uv, right, octave, cosine = _project(
+            np.ascontiguousarray(T_cam_world),
+            candidates,
+            self._point_views,
+            intrinsics_of(self.camera),
+            float(self.camera.width),
+            float(self.camera.height),
+            scale_factor,
+            len(self.scales),
+        )
         return VisiblePoints(
-            *_project(
-                np.ascontiguousarray(T_cam_world),
-                candidates,
-                self._point_views,
-                intrinsics_of(self.camera),
-                float(self.camera.width),
-                float(self.camera.height),
-                scale_factor,
-                len(self.scales),
-            )
+            index[:count], uv[:count], right[:count], octave[:count], cosine[:count]
         )
 
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
@@ -595,8 +596,9 @@ def _link_one(tables: ObservationTables, keyframe: int, feature: int, point: int
     """Add an observation of a point; a second one by the same keyframe is skipped."""
     # in the point's list
     end = tables.n_obs[point]
-    if (tables.obs_kf[point, :end] == keyframe).any():
-        return
+    for o in range(end):
+        if tables.obs_kf[point, o] == keyframe:
+            return
     tables.obs_kf[point, end] = keyframe
     tables.obs_ft[point, end] = feature
     tables.n_obs[point] += 1
@@ -712,8 +714,8 @@ def _project(
     height: float,
     scale_factor: float,
     levels: int,
-) -> tuple[Slots, Array, Array, Slots, Array]:
-    """The candidate points that the camera should see, see `VisiblePoints`.
+) -> tuple[int, Slots, Array, Array, Slots, Array]:
+    """How many of the candidate points the camera should see, and these, see `VisiblePoints`, in longer arrays.
 
     They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
     side that they were seen from before (ORB-SLAM2's ``isInFrustum``).
@@ -726,11 +728,12 @@ def _project(
     cosine = np.empty(n)
 
     # camera centre in the world
-    r = pose[:3, :3]
-    t = pose[:3, 3]
-    ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
-    oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
-    oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
+    tx = pose[0, 3]
+    ty = pose[1, 3]
+    tz = pose[2, 3]
+    ox = -(pose[0, 0] * tx + pose[1, 0] * ty + pose[2, 0] * tz)
+    oy = -(pose[0, 1] * tx + pose[1, 1] * ty + pose[2, 1] * tz)
+    oz = -(pose[0, 2] * tx + pose[1, 2] * ty + pose[2, 2] * tz)
     coarsest_scale = scale_factor ** (levels - 1)
     inverse_log = 1.0 / np.log(scale_factor)
     count = 0
@@ -768,13 +771,7 @@ def _project(
         right[count] = u - camera.bf / zc
         cosine[count] = c
         count += 1
-    return (
-        index[:count].copy(),
-        uv[:count].copy(),
-        right[:count].copy(),
-        octave[:count].copy(),
-        cosine[:count].copy(),
-    )
+    return count, index, uv, right, octave, cosine
 
 
 @kernel

@@ -122,7 +122,7 @@ class InitialPose:
         matches: The matches that agree.
         keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's
             reference.
-        share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN
+        seen_share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN
             if not verified.
         depth: Median depth of the matches' points; NaN if not verified.
         uncertainty: `relocalisation.pose_uncertainty`; NaN if not verified.
@@ -133,7 +133,7 @@ class InitialPose:
     T_cam_world: Array
     matches: Matches
     keyframe: int
-    share: float = np.nan
+    seen_share: float = np.nan
     depth: float = np.nan
     uncertainty: float = np.nan
     relocalised: bool = True

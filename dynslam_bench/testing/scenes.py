@@ -182,7 +182,13 @@ def _texture(size: int = 512) -> NDArray[np.float64]:
 def _sample(
     texture: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Colours at metres (x, y), bilinear, 250 texels a metre."""
+    """Colours ``[..., 3]`` of a wall, bilinear, 250 texels a metre.
+
+    Args:
+        texture: ``[S, S, 3]``, repeated.
+        x: Metres along the wall, any shape.
+        y: Metres, of the same shape.
+    """
     size = len(texture)
     x = x * 250
     y = y * 250

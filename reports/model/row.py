@@ -17,7 +17,7 @@ from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
-from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.layout import TrajectoryKind
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.training_scenes import seen_in_training
@@ -72,7 +72,7 @@ class RunRow(RunRecord):
 
     protocol_id: str
     protocol_digest: str
-    trajectory: Which = "online"
+    trajectory: TrajectoryKind = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_metrics: dict[str, float] = Field(default_factory=dict)
     final_coverage: float | None = None
@@ -92,7 +92,7 @@ class RunRow(RunRecord):
         """Folder of the run's files."""
         return self.store.folder(self.run_id)
 
-    def estimate(self, which: Which) -> Trajectory | None:
+    def estimate(self, which: TrajectoryKind) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
             return self.store.trajectory(self.run_id, which)
@@ -148,7 +148,7 @@ class RunRow(RunRecord):
     @cached_property
     def variant(self) -> dict[str, Any]:
         """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
-        variant: dict[str, Any] = dict(sorted(self.asked.items()))
+        variant: dict[str, Any] = dict(sorted(self.requested_settings.items()))
         if not self.imported:
             variant |= {"device": self.device, "threads": self.threads}
         if self.realtime:

@@ -411,17 +411,17 @@ def test_every_kernel_of_this_package_can_be_stored() -> None:
 def test_code_of_a_module_that_has_changed_since_its_import_is_not_stored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from dynslam_bench.features.fast import fast_corners  # uses instructions of its module
+    from dynslam_bench.features.fast import list_corners  # uses instructions of its module
 
     instructions = "dynslam_bench.features.fast"
     kernel_code.source_digest.cache_clear()
-    assert len(kernel_digest(fast_corners)) == 64
+    assert len(kernel_digest(list_corners)) == 64
     edited = dict(module_graph().modules)
     edited[instructions] = edited["dynslam_bench.core.folders"]
     monkeypatch.setattr(kernel_code, "read_module_graph", lambda: ModuleGraph(edited))
     kernel_code.source_digest.cache_clear()
     with pytest.raises(NotDescribedError, match=instructions):
-        kernel_digest(fast_corners)
+        kernel_digest(list_corners)
     kernel_code.source_digest.cache_clear()
 
 

@@ -10,7 +10,7 @@ from helpers.reports_fake_store import add_frames, add_run, fill, page_data
 
 from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.view import sequence_part_of
 
 pytestmark = [needs_browser, pytest.mark.slow]
 NAME = "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} \N{HEBREW LETTER ALEF} $x_1$"
@@ -22,7 +22,7 @@ def report(tmp_path_factory):
     root = tmp_path_factory.mktemp("browser")
     store = fill(root / "results", seeds=(0, 1))
     place = write_folder(root / "toy", 40)
-    held = part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
+    held = sequence_part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
     for name, label in (("ours", NAME), ("orb-slam2", "ORB-SLAM2 (our back end)")):
         settings = {"features.options": "one long word after the other " * 40, "features.levels": 8}
         run_id = add_run(

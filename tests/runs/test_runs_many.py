@@ -341,7 +341,7 @@ def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> 
         RunStore(store.root).prepare()  # sweeps what nobody holds
         assert work.is_dir()
         (run_id,) = store.ids()  # the other one is being made elsewhere
-        assert run_id.startswith(resolve(specs[1]).asked)
+        assert run_id.startswith(resolve(specs[1]).request_digest)
     made = call.result(300)
     assert [record.status for record in made] == ["ok", "ok"]
     assert all(

@@ -10,7 +10,7 @@ from helpers.sequence_folders import SHARED, Altered, needs_shared
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, in_camera_axes, nearest_rotation
 from dynslam_bench.sequences import SequenceView, open_sequence
-from dynslam_bench.sequences.calibration import Estimate, Window, _readout_quantity
+from dynslam_bench.sequences.calibration import CalibrationEstimate, Window, _readout_quantity
 from dynslam_bench.sequences.depth_scale import DepthScale, depth_scale
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, examine, truth_findings
 from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
@@ -367,7 +367,7 @@ def windows_at(fps):
 )
 def test_no_readout_is_longer_than_the_time_between_frames(fps, stated_s, value_s, half_s, written):
     camera = replace(CAMERA, readout_s=stated_s)
-    found = _readout_quantity(Estimate(value_s, half_s), windows_at(fps), camera)
+    found = _readout_quantity(CalibrationEstimate(value_s, half_s), windows_at(fps), camera)
     assert found.written == written
     assert found.reason
     kept = camera.readout_s if found.written is None else found.written

@@ -221,7 +221,7 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
     backend = make_backend(room)
     ahead = []
     stay = []
-    assert backend.predict(0.0) == (None, None)
+    assert backend.predict_T_world_cam(0.0) == (None, None)
     start = np.eye(4)
     for number, step in enumerate(steps):
         stamp = step / 30.0
@@ -229,18 +229,22 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
         if number > 6:
             truth = start @ path[step]
             previous = before - steps[number - 2] / 30.0
-            ahead.append(np.linalg.norm((se3.inverse(truth) @ backend.predict(stamp)[0])[:3, 3]))
-            stay.append(
-                np.linalg.norm((se3.inverse(truth) @ backend.predict(before + previous)[0])[:3, 3])
+            ahead.append(
+                np.linalg.norm((se3.inverse(truth) @ backend.predict_T_world_cam(stamp)[0])[:3, 3])
             )
-            shorter = backend.predict(stamp)[1]
-            longer = backend.predict(stamp + 1 / 30)[1]
+            stay.append(
+                np.linalg.norm(
+                    (se3.inverse(truth) @ backend.predict_T_world_cam(before + previous)[0])[:3, 3]
+                )
+            )
+            shorter = backend.predict_T_world_cam(stamp)[1]
+            longer = backend.predict_T_world_cam(stamp + 1 / 30)[1]
             assert np.trace(shorter) < np.trace(longer)
         (result,) = track_all(backend, [room.see(path[step], number, stamp=stamp)])
         if number == 0:
             start = result.T_world_cam @ se3.inverse(path[0])
     assert np.mean(ahead) < 0.5 * np.mean(stay)
-    pose, covariance = backend.predict(steps[-1] / 30.0 + MAX_GAP_S + 1e-6)
+    pose, covariance = backend.predict_T_world_cam(steps[-1] / 30.0 + MAX_GAP_S + 1e-6)
     assert covariance is None
     np.testing.assert_allclose(pose, result.T_world_cam, atol=1e-12)
 

@@ -21,7 +21,7 @@ from dynslam_bench.core import DynslamError, StudyError, read_settings
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.verdicts import LOOKS, ONE_SIDED, USUAL_SPREAD, power
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.view import sequence_part_of
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
     Plan,
@@ -564,9 +564,10 @@ def disguised(whole: Path, copy: Path, how: str) -> Path:
 def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
     copy = disguised(whole, tmp_path / "copy", how)
-    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, (
-        "digests alone pass it"
-    )
+    assert (
+        sequence_part_of(open_sequence(str(copy))).scene
+        != sequence_part_of(open_sequence(str(whole))).scene
+    ), "digests alone pass it"
     for pair in ((whole, copy), (copy, whole)):
         with pytest.raises(StudyError, match="are the same sequence"):
             check(*([str(folder)] for folder in pair))

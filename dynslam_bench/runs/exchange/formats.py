@@ -26,7 +26,7 @@ from dynslam_bench.geometry import (
     se3,
 )
 from dynslam_bench.sequences.bags import read_bag_poses
-from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list
+from dynslam_bench.sequences.readers.files import POSE, camera_poses_from_body, read_image_list
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.slam.map_files import Cloud
 
@@ -235,7 +235,7 @@ PATH_MESSAGE = "nav_msgs/msg/Path"
 
 
 def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
-    """The poses of a ROS 1 or 2 bag or an MCAP file, taken for the camera's.
+    """The poses of a ROS 1 or 2 bag or an MCAP file, which are assumed to be the camera's own.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
@@ -246,7 +246,9 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
             was not named.
     """
     stamps, rows = read_bag_poses(path, topic)
-    camera_poses = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    camera_poses = (
+        camera_poses_from_body(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    )
     if camera_poses is None:
         raise TrajectoryError(f"{path} holds no pose", "name its topic with --topic")
     return camera_poses

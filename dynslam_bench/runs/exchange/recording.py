@@ -186,11 +186,11 @@ def _log_camera(
     """Log the camera, and how features and masks are drawn.
 
     Args:
-        rr: The library.
-        stream: The recording.
+        rr: The module ``rerun``.
+        stream: rerun's ``RecordingStream``.
         camera: Intrinsics of the images at full size.
         size: Width and height of the images in the recording.
-        scale: What these are of those at full size.
+        scale: Recorded size over full size ``[2]`` (x, y).
     """
     matrix = camera.matrix * np.array([*scale, 1.0])[:, None]
     matrix[:2, 2] += 0.5 * scale  # rerun puts the corner of the top-left pixel at 0, we its centre

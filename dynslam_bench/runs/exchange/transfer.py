@@ -38,14 +38,14 @@ from dynslam_bench.runs.exchange.formats import (
     write_pose_table,
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
-from dynslam_bench.runs.layout import Which
-from dynslam_bench.runs.make_record import judge_coverage, part_digest, sequence_info
+from dynslam_bench.runs.layout import TrajectoryKind
+from dynslam_bench.runs.make_record import judge_coverage, sequence_info, sequence_part_digest
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
-from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.sequences.view import SequencePart, sequence_part_of
 from dynslam_bench.slam.map_files import read_ply
 
 _STAMP_TOLERANCE_S = 1e-5
@@ -65,13 +65,13 @@ class Exported:
     Attributes:
         folder: Where.
         files: Names of the files in it, ``provenance.json`` last.
-        which: Which trajectory.
+        which: TrajectoryKind trajectory.
         notes: What a user should know, one line each.
     """
 
     folder: Path
     files: tuple[str, ...]
-    which: Which
+    which: TrajectoryKind
     notes: tuple[str, ...]
 
 
@@ -81,7 +81,7 @@ def export_run(
     folder: str | Path | None = None,
     *,
     results: str | Path | RunStore = "results",
-    which: Which | None = None,
+    which: TrajectoryKind | None = None,
     data_root: str | Path | None = None,
     camera: str | Path | None = None,
 ) -> Exported:
@@ -93,7 +93,7 @@ def export_run(
         folder: Where; what it held is replaced. By default ``exports/<run id>/<format>`` of the
             results folder.
         results: The results folder, an archive of one, or a store.
-        which: Which trajectory; by default the final one, else the online one.
+        which: TrajectoryKind trajectory; by default the final one, else the online one.
         data_root: Folder of the recorded sequences, for formats that need images or the camera
             (COLMAP, rerun).
         camera: Camera of a folder that does not say its own, likewise.
@@ -147,14 +147,14 @@ def _is_replaceable(folder: Path) -> bool:
 
 
 def _trajectory(
-    store: RunStore, record: RunRecord, which: Which | None
-) -> tuple[Which, Trajectory]:
+    store: RunStore, record: RunRecord, which: TrajectoryKind | None
+) -> tuple[TrajectoryKind, Trajectory]:
     """The trajectory of a run that is exported, and which it is; by default the final one, else the online one.
 
     Raises:
         RunError: The run has no such trajectory.
     """
-    wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
+    wanted: tuple[TrajectoryKind, ...] = ("final", "online") if which is None else (which,)
     for kind in wanted:
         if trajectory := store.trajectory(record.run_id, kind):
             return kind, trajectory
@@ -168,7 +168,7 @@ def _write(
     work: Path,
     store: RunStore,
     record: RunRecord,
-    which: Which,
+    which: TrajectoryKind,
     trajectory: Trajectory,
     reopened: Callable[[], Sequence],
 ) -> list[str]:
@@ -179,7 +179,7 @@ def _write(
         work: The folder.
         store: The run's.
         record: The run.
-        which: Which of its trajectories.
+        which: TrajectoryKind of its trajectories.
         trajectory: That trajectory.
         reopened: Opens the frames of the run, for formats that need images or the camera.
 
@@ -265,7 +265,7 @@ class Provenance(Record):
         schema_version: Version of this record's fields.
         format: Name of the format.
         files: SHA-256 of every file by its name.
-        which: Which trajectory: ``online`` or ``final``.
+        which: TrajectoryKind trajectory: ``online`` or ``final``.
         run: The record of the run, without the command line and the folders of the machine that
             made it.
         written_by: Version of this package.
@@ -274,7 +274,7 @@ class Provenance(Record):
     schema_version: int = 1
     format: str
     files: dict[str, str]
-    which: Which
+    which: TrajectoryKind
     run: RunRecord
     written_by: str = ""
 
@@ -340,7 +340,7 @@ def open_stored(
     start, stop = record.frames or (0, None)
     place = record.place or record.sequence.id
     sequence = open_frames(place, data_root, camera, (start + record.offset, stop), record.stride)
-    if part_of(sequence, record.offset).content != record.sequence.content:
+    if sequence_part_of(sequence, record.offset).content != record.sequence.content:
         raise RunError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
 
@@ -356,7 +356,7 @@ def import_trajectory(
     results: str | Path | RunStore = "results",
     label: str = "",
     provenance: str = "",
-    which: Which = "final",
+    which: TrajectoryKind = "final",
     frames: Frames = None,
     stride: int = 1,
     data_root: str | Path | None = None,
@@ -432,7 +432,7 @@ def import_trajectory(
         tracker=TrackerInfo(
             id=tracker, label=label or f"{tracker} (imported)", provenance="external"
         ),
-        sequence=reference.info(part_digest(identity)),
+        sequence=reference.info(sequence_part_digest(identity)),
         frames=None if frames is None else parse_frames(frames),
         stride=stride,
         n_frames=coverage.total,
@@ -462,8 +462,8 @@ def import_trajectory(
 def _identity_of_import(
     file: Path,
     tracker: str,
-    which: Which,
-    part: Part,
+    which: TrajectoryKind,
+    part: SequencePart,
     timestamps: str | Path | None,
     topic: str | None,
 ) -> dict[str, Any]:
@@ -472,7 +472,7 @@ def _identity_of_import(
     Args:
         file: The trajectory; its content counts, not its name.
         tracker: Name of the system that made it.
-        which: Which trajectory of the system it is.
+        which: TrajectoryKind trajectory of the system it is.
         part: The part of the sequence that it was made on.
         timestamps: File of the stamps where the format has none; its content counts.
         topic: The topic that was taken of a bag.
@@ -507,7 +507,7 @@ class _Reference:
         knows_frames: Whether its images are here.
     """
 
-    part: Part
+    part: SequencePart
     timestamps_ns: NDArray[np.int64]
     ground_truth: Trajectory | None
     info: Callable[[str], SequenceInfo]
@@ -516,7 +516,7 @@ class _Reference:
 
 def _reference_by_images(opened: Sequence) -> _Reference:
     """A sequence whose images are here."""
-    part = part_of(opened)
+    part = sequence_part_of(opened)
     return _Reference(
         part=part,
         timestamps_ns=timestamps_ns(opened),
@@ -539,16 +539,16 @@ def _reference_by_truth(sequence: str, truth: TumFile) -> _Reference:
     )
 
 
-def _part_by_truth(sequence: str, truth: Trajectory) -> Part:
+def _part_by_truth(sequence: str, truth: Trajectory) -> SequencePart:
     """The whole of a sequence of which only the ground truth is here."""
     entry = entry_of(sequence)
     content = digest([truth.timestamps_ns.tolist(), truth.T_world_cam.round(9).tolist()])
-    return Part(
+    return SequencePart(
         sequence if entry is None else entry.id, content, content, {}, 0, len(truth), 1, None
     )
 
 
-def _info_by_truth(part: Part, truth: Trajectory, name: str) -> SequenceInfo:
+def _info_by_truth(part: SequencePart, truth: Trajectory, name: str) -> SequenceInfo:
     """What is known of a sequence without its images: the catalogue's entry and the camera's motion.
 
     Args:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, dividing_kernel
 from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
 from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
-from dynslam_bench.sequences.synthetic.textures import Atlas
+from dynslam_bench.sequences.synthetic.textures import TextureAtlas
 
 Ints = NDArray[np.integer]
 Reals = NDArray[np.floating]
@@ -372,7 +372,7 @@ def shade_pixels(
     tiles: Tiles,
     primitives: Primitives,
     materials: Materials,
-    atlas: Atlas,
+    atlas: TextureAtlas,
     lights: Reals,
     hit: Ints,
     depth: Reals,

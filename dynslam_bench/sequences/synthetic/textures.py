@@ -12,7 +12,7 @@ Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""
 
 
-class Atlas(NamedTuple):
+class TextureAtlas(NamedTuple):
     """All T textures and their mip levels as one array.
 
     Attributes:
@@ -31,7 +31,7 @@ _LEVELS = 12
 """Mip levels of a texture, at most: of an edge of 2048 texels."""
 
 
-def build_atlas(textures: list[Image]) -> Atlas:
+def build_atlas(textures: list[Image]) -> TextureAtlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
     level_offset = np.zeros((len(textures), _LEVELS), np.int64)
     log2_size = np.zeros(len(textures), np.int32)
@@ -52,7 +52,7 @@ def build_atlas(textures: list[Image]) -> Atlas:
             current = 0.25 * (
                 current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]
             )
-    return Atlas(np.concatenate(parts), level_offset, log2_size)
+    return TextureAtlas(np.concatenate(parts), level_offset, log2_size)
 
 
 def smooth_noise(

@@ -24,19 +24,19 @@ from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     SemanticSystemSettings,
     SystemSettings,
-    system,
+    system_spec,
 )
 from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
 
 Groups = Mapping[str, Settings]
 """Groups of settings, by name."""
 
-TESTS = (
+FILTERS = (
     ("epipolar:EpipolarFilter", "epipolar"),
-    ("ego_motion:RigidMotionFilter", "motion"),
+    ("rigid_motion:RigidMotionFilter", "motion"),
     ("free_space:FreeSpaceFilter", "free_space"),
 )
-"""The rules of all systems here, in the order of application; each needs its group of settings."""
+"""The filters of all systems here, in the order of application; each needs its group of settings."""
 EPIPOLAR: Groups = {"flow": FlowSettings(), "epipolar": EpipolarSettings()}
 """The sparse flow and the guarded epipolar test."""
 OWN: Groups = {**EPIPOLAR, "motion": RigidMotionSettings(), "free_space": FreeSpaceSettings()}
@@ -126,8 +126,8 @@ def _spec(
     name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any
 ) -> TrackerSpec:
     """The spec of one of these systems; `more` are further fields of `TrackerSpec`."""
-    filters = TESTS if "masks=vote" in name else (SEMANTIC, *TESTS)
-    return system(
+    filters = FILTERS if "masks=vote" in name else (SEMANTIC, *FILTERS)
+    return system_spec(
         name,
         label,
         filters,
