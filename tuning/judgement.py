@@ -70,8 +70,8 @@ class SceneErrors(Record):
 
     Attributes:
         scene: The scene.
-        baseline_m: Errors of the baseline, metres.
-        candidate_m: Errors of the candidate, metres.
+        baseline_m: ATE of the baseline, metres.
+        candidate_m: ATE of the candidate, metres.
         lost_by_baseline: Whether the baseline lost at least half of its runs there.
         lost: Whether the candidate did.
     """

@@ -182,7 +182,7 @@ def _fill_nearby_mean(
 def nearest_depth(
     depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Depth ``[N]``, metres, closest to `expected` in the 3x3 patch around each raw pixel.
+    """The depth closest to `expected` in the 3x3 patch around each raw pixel.
 
     Thus depth edges and sub-pixel flow errors do not count as motion.
 
