@@ -63,9 +63,9 @@ class Exported:
     """Files that `export_run` wrote, with notes on what they lack.
 
     Attributes:
-        folder: Where.
+        folder: The folder of the export.
         files: Names of the files in it, ``provenance.json`` last.
-        which: TrajectoryKind trajectory.
+        which: The trajectory that was written: ``online`` or ``final``.
         notes: What a user should know, one line each.
     """
 
@@ -90,26 +90,27 @@ def export_run(
     Args:
         run: A record, or the run's id, its first digits or ``latest``.
         form: A name of `FORMATS`.
-        folder: Where; what it held is replaced. By default ``exports/<run id>/<format>`` of the
-            results folder.
+        folder: Folder of the export; what it held is replaced. By default
+            ``exports/<run id>/<format>`` of the results folder.
         results: The results folder, an archive of one, or a store.
-        which: TrajectoryKind trajectory; by default the final one, else the online one.
+        which: The trajectory to write; by default the final one, else the online one.
         data_root: Folder of the recorded sequences, for formats that need images or the camera
             (COLMAP, rerun).
-        camera: Camera of a folder that does not say its own, likewise.
+        camera: Camera of a folder that does not say its own, for these formats.
 
     Raises:
         RunError: There is no such run or format, or the run has no such trajectory.
         DynslamError: The sequence is not here although the format needs it, a library is missing,
             or the folder cannot be written.
     """
-    # what is asked for, and where it goes
+    # refuse what cannot be exported, and find the run
     if form not in FORMATS:
         raise RunError(f"there is no format '{form}'", did_you_mean(form, FORMATS))
     if folder is None and not isinstance(results, RunStore) and Path(results).is_file():
         raise RunError(f"{results} is an archive, which gets no exports", "name a folder, with -o")
     store = results if isinstance(results, RunStore) else open_store(results)
     record = store.read(run) if isinstance(run, str) else run
+
     # the trajectory, and the folder, which must be free or an earlier export
     chosen, trajectory = _trajectory(store, record, which)
     if folder is None:
@@ -120,7 +121,8 @@ def export_run(
         raise RunError(
             f"{target} exists and is no export", "name a folder that does not exist, with -o"
         )
-    # the files, then their digests beside what made them
+
+    # write the files, then their digests beside the run's record
     with atomic_folder(target) as work:
         notes = _write(
             form,
@@ -179,8 +181,8 @@ def _write(
         work: The folder.
         store: The run's.
         record: The run.
-        which: TrajectoryKind of its trajectories.
-        trajectory: That trajectory.
+        which: Kind of the trajectory, ``online`` or ``final``.
+        trajectory: The trajectory, camera-to-world poses.
         reopened: Opens the frames of the run, for formats that need images or the camera.
 
     Returns:
@@ -234,15 +236,17 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
     Returns:
         What a user should know, one line each.
     """
-    # poses of images alone: COLMAP has a pose for each image
+    # only poses with an image: COLMAP has one pose for each image
     rows_of_frames, rows_of_poses = associate(
         sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S
     )
-    # without files they are named as TUM names them
+
+    # names of these images; rendered ones get names as TUM gives them
     files: dict[float, str] = getattr(sequence, "colour_files", {})
     stamps = sequence.timestamps[rows_of_frames].tolist()
     names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in stamps]
-    # map points, and the poses of those images
+
+    # write the images with their poses, and the map's points
     points = read_ply(cloud) if cloud.is_file() else None
     poses = trajectory.select(np.asarray(rows_of_poses))
     write_colmap(work, poses, sequence.camera, names, points)
@@ -265,7 +269,7 @@ class Provenance(Record):
         schema_version: Version of this record's fields.
         format: Name of the format.
         files: SHA-256 of every file by its name.
-        which: TrajectoryKind trajectory: ``online`` or ``final``.
+        which: The trajectory that was written: ``online`` or ``final``.
         run: The record of the run, without the command line and the folders of the machine that
             made it.
         written_by: Version of this package.
@@ -472,7 +476,7 @@ def _identity_of_import(
     Args:
         file: The trajectory; its content counts, not its name.
         tracker: Name of the system that made it.
-        which: TrajectoryKind trajectory of the system it is.
+        which: Kind of the trajectory, ``online`` or ``final``.
         part: The part of the sequence that it was made on.
         timestamps: File of the stamps where the format has none; its content counts.
         topic: The topic that was taken of a bag.
@@ -643,7 +647,7 @@ def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str)
     Raises:
         RunError: Fewer than two poses are near a frame.
     """
-    # poses with a frame's own stamp, and poses near a frame
+    # poses with a frame's own stamp, and poses near a frame: others may have rounded the stamps
     exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
     near, _ = associate(stamps, trajectory.timestamps, _IMPORT_TOLERANCE_S)
     if len(near) < 2:
