@@ -207,7 +207,7 @@ def test_a_text_without_its_noun_is_found(docstring: str, found: list[str]) -> N
 def test_docstrings_begin_with_their_noun() -> None:
     assert [
         f"{file.relative_to(ROOT)}:{line}: {text}"
-        for file in sources()
+        for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]
         for line, docstring in read(file)[0]
         for text in refers_back(docstring)
     ] == []
