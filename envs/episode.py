@@ -125,7 +125,7 @@ def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
 
     Args:
         info: The ``info`` dictionary of a step.
-        protocol: Whose metrics are those of the episode.
+        protocol: Protocol of the episode's metrics.
     """
     missing: dict[str, Any] = {"pose": np.zeros(7)} | dict.fromkeys(_ERRORS, 0.0)
     metrics = _flagged(info.get("episode_metrics", {}), dict.fromkeys(metric_names(protocol), 0.0))

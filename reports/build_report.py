@@ -883,7 +883,7 @@ class Site:
     Attributes:
         index: Its first page.
         files: How many files it has.
-        size_mb: Their size in MB.
+        size_mb: Size of all files in MB.
     """
 
     index: Path

@@ -305,7 +305,7 @@ def _add_static_camera(figure: go.Figure, static_mm: float, first_line: list[str
 
     Args:
         figure: The figure.
-        static_mm: That error, millimetres.
+        static_mm: Error of a static camera, millimetres.
         first_line: The first line of the figure, in a list of one.
     """
     # an invisible point on the line: axes are fitted to points, not to lines

@@ -98,7 +98,8 @@ class Candidate(Record):
             is not the best.
         recorded: ATE on recordings, which is said and decides nothing; None without any, or if it is not the best.
         scene_errors: Its ATE and the baseline's in each scene that judges; empty where none judged.
-        beyond: By the means of the judging families that no trial saw; None for fewer than `FEWEST` of them.
+        beyond: Comparison by the means of the judging families that no trial saw; None for fewer
+            than `FEWEST` of them.
         on_confirm: ATE and processor time on the instances of the choice, by objective.
         on_held_out: ATE and processor time on the held-out instances, by objective.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
@@ -423,7 +424,7 @@ def next_step(
 
 
 def families_sentence(design: Design) -> str:
-    """On which families a study judges, and whether its trials saw other scenes of them."""
+    """A sentence on the families that a study judges on, and on whether its trials saw other scenes of them."""
     judging = _families(design.judging)
     tuned = _tuned_families(design)
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"

@@ -36,7 +36,7 @@ class Outcome:
     """One configuration on one instance.
 
     Attributes:
-        instance: Where.
+        instance: The instance that was run.
         run_id: The run.
         ate_m: ATE RMSE in metres, lost frames held at the last pose.
         coverage: Share of frames that were tracked.

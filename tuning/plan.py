@@ -210,7 +210,7 @@ class Plan:
         trackers: The trackers to choose from, the study's own first.
         search: The space.
         space: What is tuned, as its parameters.
-        design: On which instances.
+        design: Instances that the study runs on, by what they are for.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit or missing.
@@ -610,7 +610,7 @@ def _check_repeats(
 
     Args:
         instances: Instances of the splits that may share a recording.
-        opened: Their sequences by name.
+        opened: Sequences of the instances, by name.
         apart: Instances that may share no frame with the others, whether they are repeats or not.
 
     Raises:

@@ -359,8 +359,8 @@ class Study(Plan):
 
         Args:
             settings: Overrides, dotted name to value.
-            instances: Where.
-            tracker: Whose; the study's if empty.
+            instances: Instances that are run.
+            tracker: Id of the tracker; the study's if empty.
             cache: Whether to use the stage cache, whose times are those of when its entries were
                 made; None for what the study says.
 
@@ -405,7 +405,7 @@ class Study(Plan):
 
         Args:
             configurations: What to run.
-            instances: Where.
+            instances: Instances that each is run on.
             jobs: Runs at a time.
             cache: Whether to use the stage cache, with which times cannot be compared.
             crash_is_loss: Whether a baseline that crashes has lost that instance, and no more.

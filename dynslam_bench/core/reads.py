@@ -400,7 +400,7 @@ class Verifier:
 
     Args:
         path: The import path of the runs; None for that of this process.
-        environment: Their environment variables; None for those of this process.
+        environment: Environment variables of the runs; None for those of this process.
     """
 
     def __init__(

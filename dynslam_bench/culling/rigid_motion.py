@@ -129,7 +129,7 @@ def nearby_mean(
 
     Args:
         xy: Raw pixels of the points ``[N, 2]``.
-        z: Their depths ``[N]``, metres, 0 missing.
+        z: Depths of the points ``[N]``, metres, 0 missing.
         values: ``[N, K]``.
         at: Raw pixels ``[M, 2]``.
         at_z: Depths there ``[M]``, metres; where 0, points of any depth count.

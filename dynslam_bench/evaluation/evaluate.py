@@ -68,7 +68,8 @@ class Evaluation(Record):
         n_pairs_rpe: Pairs of poses that each relative error is taken over, by its key.
         n_input: Input frames; None where they are not known.
         n_tracked: Input frames with a tracked pose; None where the input frames are not known.
-        coverage: Their ratio.
+        coverage: Share of the input frames with a tracked pose, 0 to 1; None where they are not
+            known.
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
         diagnostics: One line for each fact that the numbers depend on.

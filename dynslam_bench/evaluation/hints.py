@@ -394,7 +394,7 @@ class Hint:
     """A probable fault of an estimate.
 
     Attributes:
-        id: Which.
+        id: Id of the fault.
         text: One line: what was measured, and the cure.
         numbers: What was measured, by name with its unit.
     """

@@ -175,7 +175,7 @@ class PairedRatio(Record):
         much_better: Scenes where the baseline has more than `CATASTROPHE` times the error.
         lost_both: Scenes that both lost.
         worst: The scene with the largest ratio; empty where `ratio` is None.
-        worst_ratio: That ratio; None likewise.
+        worst_ratio: Ratio of that scene; None where `ratio` is None.
         one_sided: Level of a claim.
         runs: Paired runs behind the scenes.
         lost_runs: How many of them the candidate lost, and the baseline, whether or not that lost a

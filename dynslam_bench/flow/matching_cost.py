@@ -109,7 +109,7 @@ def cost_tables(
         shape: Image height and width in pixels.
         terms: 1 for the descriptors' term alone, 3 for grey level and gradient too.
         support: Number of points around p (1, 5 for a cross, 9 for a square).
-        spacing: Their distance in pixels.
+        spacing: Distance between these points, pixels.
     """
     offsets, ring_level = layout.sampling_table()
     geometry = layout.map_geometry(*shape)

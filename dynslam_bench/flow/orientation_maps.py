@@ -370,7 +370,7 @@ def blur_cascade(
         pitch: Numbers a line.
         row: The newest source row.
         rows: Rows of the levels.
-        columns: Their columns.
+        columns: Columns of the levels.
         top: First row of the stripe.
         bottom: One past its last row.
         blurs: int64 ``[L, 2]``, taps and distance of each level.

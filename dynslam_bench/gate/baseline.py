@@ -181,7 +181,7 @@ class Baseline(Record):
     Attributes:
         schema_version: Version of this record's fields.
         question: Digest of the question that it was recorded for.
-        asked: That question, so that a change of it can be named.
+        asked: The question in full, so that a change of it can be named.
         protocol: Id of the protocol of the errors.
         protocol_digest: Its digest.
         code: Digest of the evaluation code.

@@ -88,7 +88,7 @@ def init(
     Args:
         path: The file.
         trackers: What is run, see `GateConfig`.
-        sequences: On what; without any on eight rendered scenes.
+        sequences: Sequences that are run; without any eight rendered scenes.
         frames: Part of every sequence.
         build: Command that builds a checkout.
 

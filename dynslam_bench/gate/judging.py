@@ -40,7 +40,7 @@ class Findings(NamedTuple):
     """What both sides show after some rounds.
 
     Attributes:
-        verdict: On the error.
+        verdict: Verdict on the error.
         estimate: Mean log ratio with its interval; None where nothing could be compared.
         level: Two-sided level of the interval.
         lost: Runs that the candidate lost, and the baseline.

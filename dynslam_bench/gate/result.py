@@ -50,7 +50,7 @@ class GuardrailResult(Record):
     """A guardrail beside the error.
 
     Attributes:
-        name: Which.
+        name: Name of the guardrail.
         state: ``held``; ``broken``; ``open``: the scatter is too large to tell; ``not measured``.
         limit: What was allowed.
         measured: What was measured; None where it was not.
@@ -69,7 +69,7 @@ class GateResult(Record):
 
     Attributes:
         schema_version: Version of this record's fields.
-        verdict: On the error.
+        verdict: Verdict on the error.
         exit_code: 0 passed, 3 runs failed, 4 regressed or a guardrail is broken, 5 undecided.
         sentence: The verdict in words.
         question: Digest of the question.

@@ -176,7 +176,7 @@ def _stamps_of(
 
     Args:
         texts: The stamps as they are written ``[N]``.
-        values: Their numbers.
+        values: The stamps as numbers ``[N]``.
         source: The file.
         stated: The unit that its heading states; None where it states none.
         moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``;

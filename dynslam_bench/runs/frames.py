@@ -291,7 +291,7 @@ class FrameLog:
         """Write `frames.csv` and `trajectory_online.txt`.
 
         Args:
-            folder: Where.
+            folder: The folder.
             comment: Head of the trajectory.
             exact: The nanoseconds of the frames' stamps by their seconds, where a float does not
                 hold them.

@@ -218,9 +218,9 @@ class RunRecord(Record):
             None for systems without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks
             of people; None where either is missing.
-        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``)
-            excluded; ``processor`` the processor time of the run's own process in it; ``detector``
-            is a network beside it.
+        timings: Times of the stages, by stage; ``total`` is the frame time: segmentation included,
+            decoding (``read``) excluded; ``processor`` the processor time of the run's own process
+            in it; ``detector`` is a network beside it.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
         wall_s: Wall-clock time of the whole run.

@@ -23,7 +23,7 @@ from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name
 
 CLASSES_FILE = "classes.json"
-"""Beside the masks: the class name of each number."""
+"""Lies beside the masks, and holds the class name of each number."""
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
 MISSPELLED = 0.8

@@ -210,7 +210,7 @@ def check_classes(
 
     Args:
         known: The names of its classes, without the background.
-        settings: Their `classes` are the dynamic ones.
+        settings: Settings whose `classes` are the dynamic ones.
         where: The source's file, folder or sequence, for the error.
         whose: What the classes are of, e.g. ``the network``.
 

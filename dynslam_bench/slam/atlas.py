@@ -64,7 +64,7 @@ class Atlas:
     Args:
         slam_map: Keyframes and points of all maps.
         submaps: Submaps of a loaded map; they get the numbers from 1 on.
-        unit_ratio: By how much units of length of two maps may differ: 1 with depth.
+        unit_ratio: Factor by which units of length of two maps may differ: 1 with depth.
 
     Attributes:
         map: Keyframes and points of all maps.
@@ -162,7 +162,7 @@ class Atlas:
             number: The submap.
             moved: Where in the root map's world the merge puts a place ``[3]`` of the submap,
                 ``[3]``.
-            drift_m: By how much drift may have put it too far away.
+            drift_m: Distance by which drift may have put it too far away, in units of the root map.
         """
         submap = self.submaps[number]
         return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)

@@ -121,7 +121,7 @@ class Correction:
 
     @property
     def T_now_before(self) -> Array:
-        """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
+        """Transform ``[4, 4]`` from the keyframe's world, once its lengths are multiplied, to the place's world."""
         before = self.T_cam_before.copy()
         before[:3, 3] *= self.scale
         return se3.inverse(self.T_cam_now) @ before
@@ -698,7 +698,7 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
         ids: Ids of the keyframes, int64 ``[N]``, ascending.
         edges: Edges along which scale was kept. The oldest keyframe of each connected component
             stays.
-        loop_edge: From the keyframe that was recognised to the one that recognises it.
+        loop_edge: Edge from the keyframe that was recognised to the one that recognises it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
     Returns:

@@ -187,7 +187,7 @@ class Map:
         n_obs: int32 ``[M]``, number of observations.
         obs_kf: int32 ``[M, O]``, slots of the observing keyframes, oldest first.
         obs_ft: int32 ``[M, O]``, their features.
-        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors
+        substrings: The keyframe's id and sorted substrings of its descriptors, by keyframe slot
             (`relocalisation`).
     """
 
@@ -332,7 +332,7 @@ class Map:
 
         Args:
             number: The submap.
-            T_new_old: From the submap's world to the world of the other, ``[4, 4]``.
+            T_new_old: Transform ``[4, 4]`` from the submap's world to the world of the other.
             merged_into: Number of the submap that it becomes part of.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """

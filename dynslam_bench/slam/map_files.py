@@ -152,7 +152,7 @@ class SavedMap:
 
     Attributes:
         header: Where it comes from.
-        arrays: By name, see `KEYFRAME_ARRAYS` and those after it.
+        arrays: Arrays by name, see `KEYFRAME_ARRAYS` and those after it.
     """
 
     header: MapHeader

@@ -345,8 +345,8 @@ def check_segmenter(
 
     Args:
         construct: Builds a segmenter.
-        sequence: Whose frames to segment; the built-in scene by default.
-        frames: How many.
+        sequence: Sequence whose frames are segmented; the built-in scene by default.
+        frames: Number of frames.
 
     Raises:
         ConformanceError: Names every failed check, the fault and the likely cause.

@@ -58,7 +58,7 @@ class Sequences(NamedTuple):
     """The sequences of a board, in one order.
 
     Attributes:
-        names: Their names ``[S]``.
+        names: Names of the sequences ``[S]``.
         families: The family of each ``[S]``.
         weights: Weight of each family.
     """
@@ -240,8 +240,8 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     families alone where their scatter has `FEWEST_FREE` degrees of freedom, else there is none.
 
     Args:
-        log_ratios: Their logarithms ``[S]``.
-        sequences: Their sequences.
+        log_ratios: Natural logarithms of the ratios ``[S]``.
+        sequences: Sequences of the ratios.
     """
     tested = sequences.test(log_ratios)
     mean = float(np.exp(tested.centre))

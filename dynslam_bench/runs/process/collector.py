@@ -187,7 +187,7 @@ class Collector:
 
     Args:
         base_folders: The folders in which names of files begin.
-        origins: Whose files are.
+        origins: Tells whose a file is.
         private: Beginnings of the paths of what the run owns.
     """
 

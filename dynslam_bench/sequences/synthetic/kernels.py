@@ -71,7 +71,7 @@ class DepthModel(NamedTuple):
 
     Attributes:
         fx: Focal length, pixels.
-        baseline_m: From the camera to the projector.
+        baseline_m: Distance from the camera to the projector, metres.
         disparity_noise_px: Standard deviation of the disparity.
         near_m: Nothing nearer is measured.
         far_m: Nothing further is measured.
