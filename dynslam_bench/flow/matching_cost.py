@@ -161,17 +161,19 @@ def truncated_penalty(
 def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
     """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in.
 
-    `level` is a row of `CostTables.ring0` or `ring1`: base, stride, shift, bias.
+    `level` is a row of `CostTables.ring0` or `ring1`: base, stride, shift, bias. A cell is
+    ``2**shift`` quarter pixels wide.
     """
     base = level[0]
     stride = level[1]
     shift = level[2]
     bias = level[3]
-    # quarter pixels, then half cells
+    # the position in quarter pixels, then in half cells
     xq = np.int64(x * np.float32(4) + np.float32(0.5)) + bias
     yq = np.int64(y * np.float32(4) + np.float32(0.5)) + bias
     xh = xq >> (shift - 1)
     yh = yq >> (shift - 1)
+    # the cell, eight bytes each, and the half in which the position lies on either axis
     cell = base + (yh >> 1) * stride + (xh >> 1)
     return 8 * cell, 2 * (yh & 1) + (xh & 1)
 

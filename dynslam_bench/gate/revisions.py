@@ -196,6 +196,11 @@ class Runner:
         return str(answer["run_id"])
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Send a request as a line of JSON, and wait for the line of its answer.
+
+        Raises:
+            InfrastructureError: The process has ended.
+        """
         asked = self._process.stdin
         answers = self._process.stdout
         line = ""

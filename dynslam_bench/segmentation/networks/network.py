@@ -385,9 +385,9 @@ class RoIHeads(nn.Module):
         """Objects of one image (inference).
 
         Args:
-            levels: P2..P5 ``[1, C, H, W]``.
-            mask_levels: m2..m5.
-            proposals: ``[K, 4]``.
+            levels: P2..P5 ``[1, C, H_l, W_l]``.
+            mask_levels: m2..m5, the mask branch's levels ``[1, C, H_l, W_l]``.
+            proposals: Boxes ``[K, 4]``, input pixels x0 y0 x1 y1.
             image_height: Height of the padded input, pixels.
             size: Height and width of the image inside it.
             score: Least score.
@@ -402,7 +402,7 @@ class RoIHeads(nn.Module):
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
 
-        # what is confident and not empty, suppressed within each class
+        # boxes that are confident and not empty, suppressed within each class
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         box = boxes[keep]
         best = scores[keep]
@@ -411,6 +411,8 @@ class RoIHeads(nn.Module):
         box = box[chosen]
         best = best[chosen]
         label = label[chosen]
+
+        # of each box the mask of its class
         mask_logits = self.masks(mask_levels, [box], image_height)
         masks = mask_logits[torch.arange(len(label), device=label.device), label].sigmoid()
         return Detections(box, label, best, masks)
