@@ -131,7 +131,7 @@ Fact = tuple[str, str, list[str]]
 
 @dataclass(frozen=True)
 class _Content:
-    """What a report shows, before it is written.
+    """Content of a report before it is written.
 
     Attributes:
         title: Heading.
@@ -322,7 +322,7 @@ def pages_for(runs: int, typical: int) -> int:
 
     Args:
         runs: Runs of the report.
-        typical: Those of them with the median error of their cell.
+        typical: Runs among them that have the median error of their cell.
     """
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
@@ -426,7 +426,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         rows=content.board.rows,
     ).write(paths.data)
 
-    # the pages
+    # write the pages of the report
     write_assets(output)
     write_atomic(paths.html, _first_page(content, facts, footer))
     for page in content.sections:
@@ -808,7 +808,7 @@ def provenance_section(board: Board, loaded: LoadedRuns, again: str) -> Section:
         loaded: What was read from the stores.
         again: The command that makes this report again.
     """
-    # commands
+    # commands that made the runs, each once
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     codes = {
@@ -895,7 +895,7 @@ class Site:
     Attributes:
         index: Its first page.
         files: How many files it has.
-        size_mb: Their size in MB.
+        size_mb: Size of all files in MB.
     """
 
     index: Path
@@ -928,9 +928,10 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
-        most_pages: As in `build_report`; a page takes about 30 kB.
-        most_pictures: As in `build_report`; the pictures of a run take about 0.4 MB.
-        on_progress: As in `build_report`.
+        most_pages: Runs that have a page of their own, see `build_report`; a page takes about 30 kB.
+        most_pictures: Runs whose pictures are shown, see `build_report`; the pictures of a run take
+            about 0.4 MB.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
         ReportError: There are no runs, or the folder of a study holds no page.

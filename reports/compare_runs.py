@@ -39,7 +39,7 @@ Variants = Mapping[str, list[RunRow]]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from A to B.
+    """Changes from A to B: every tracker's errors on the common sequences, and the verdict.
 
     Attributes:
         overall: Tracker and what differs to B's median ATE over A's: the typical ratio over
@@ -79,8 +79,8 @@ def compare(
     the fewest values.
 
     Args:
-        a: Results folder, store, or folder of a report (``report.json``).
-        b: The other results folder, store, or folder of a report.
+        a: First side: a results folder, a store, or the folder of a report (``report.json``).
+        b: Second side, named in one of these ways.
         protocol: How results folders are evaluated; a report brings its own.
         output: Folder of a page that shows it; None for none.
         conclusion: What the page says in place of the verdict, where another rule judged the runs.
@@ -374,7 +374,7 @@ def _numbers(ratio: PairedRatio) -> list[float | None]:
 
 
 def _sentence(ratio: PairedRatio) -> str:
-    """What was found, as the page says it."""
+    """The finding in a sentence, as the page says it."""
     return f"{'. '.join(findings(ratio, 'B'))}. Verdict: {verdict_of(ratio).value}."
 
 

@@ -87,7 +87,7 @@ def _trackers(spec: StudySpec) -> list[str]:
 
 
 def known_settings(tracker: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the values that a tracker has settings for."""
+    """The values that a tracker has settings for."""
     names = set(field_names(TRACKERS.get(tracker).settings))
     return {name: value for name, value in values.items() if name in names}
 
@@ -117,7 +117,7 @@ FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion
 
 
 class Preview(Record):
-    """What a study could show, before it runs.
+    """Preview of a study before it runs: the differences that it could show, and its time.
 
     Attributes:
         scenes: Scenes that judge it: held-out ones, or those of `confirm`.
@@ -128,7 +128,7 @@ class Preview(Record):
         power: Chance of *proven* for a candidate with `GAIN` less error.
         detectable: Smallest gain, as a share, that is proven in four of five studies.
         needed: Scenes that prove `GAIN` in four of five.
-        minutes: Of the whole study if no trial is pruned.
+        minutes: Estimated minutes of the whole study if no trial is pruned.
         unused: Settings of the space that belong to a part whose verdicts are not used on these
             scenes, and why.
         include: The space without them, as a study names it; empty where nothing is unused.
@@ -208,11 +208,11 @@ class Plan:
         baseline: What ratios are to.
         default_configuration: The tracker's default settings, where the baseline is something else.
         defaults: The settings of trial 0.
-        base: The same by dotted name, and the settings of other trackers to choose from.
+        base: Settings of trial 0 by dotted name, with those of the other trackers to choose from.
         trackers: The trackers to choose from, the study's own first.
         search: The space.
         space: What is tuned, as its parameters.
-        design: On which instances.
+        design: Instances that the study runs on, by what they are for.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit or missing.
@@ -321,7 +321,7 @@ class Plan:
         return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
-        """What a configuration of the space runs with: its tracker, and those settings that it has."""
+        """Tracker and settings that a configuration of the space runs with."""
         settings = {**self.held, **params}
         tracker = str(settings.pop(TRACKER, self.spec.tracker))
         if len(self.trackers) > 1:
@@ -440,7 +440,7 @@ class Design:
 
     @property
     def judging(self) -> tuple[ProblemInstance, ...]:
-        """What judges: the held-out instances, or else `confirm`."""
+        """Instances that judge: the held-out ones, or else `confirm`."""
         return self.held_out or self.confirm
 
 
@@ -557,7 +557,7 @@ def check_splits(
     the catalogue, or its scene, gives to one split must not stand in the other.
 
     Args:
-        name: Of the study.
+        name: Name of the study.
         splits: Its instances: to tune on, to judge the survivors on, and held out.
         data_root: Folder of the recorded sequences.
 
@@ -615,9 +615,9 @@ def _check_repeats(
     """Refuse instances of one scene that share frames and are no repeats of each other.
 
     Args:
-        instances: Of the splits that may share a recording.
-        opened: Their sequences by name.
-        apart: Those of them that may share no frame with the others, whether repeats or not.
+        instances: Instances of the splits that may share a recording.
+        opened: Sequences of the instances, by name.
+        apart: Instances that may share no frame with the others, whether they are repeats or not.
 
     Raises:
         StudyError: Two share frames, or an instance is named twice.
@@ -644,7 +644,7 @@ def _check_repeats(
 
 
 def _images(instance: ProblemInstance, part: SequencePart) -> tuple[object, ...]:
-    """What decides the images that a tracker sees, and the numbers that it draws, within a scene."""
+    """Key of the images that a tracker sees, and of the random numbers that it draws, within a scene."""
     return part.block, part.noise, instance.offset, instance.degradation, instance.seed
 
 
@@ -748,7 +748,7 @@ def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
     """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
 
     Args:
-        settings: Of the system.
+        settings: Settings of the system.
         sequences: What it runs on.
 
     Returns:

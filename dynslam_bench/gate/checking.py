@@ -88,7 +88,7 @@ def init(
     Args:
         path: The file.
         trackers: What is run, see `GateConfig`.
-        sequences: On what; without any on eight rendered scenes.
+        sequences: Sequences that are run; without any eight rendered scenes.
         frames: Part of every sequence.
         build: Command that builds a checkout.
 
@@ -190,7 +190,7 @@ def _in_turns(
 
     Args:
         baseline: One side.
-        candidate: The other one.
+        candidate: The candidate's side.
         cases: What a round runs.
         gate: The question.
         on_run: Told of every run.
@@ -413,7 +413,7 @@ def check(
 
 @dataclass
 class _GateOutcome:
-    """What a gate found, and how.
+    """Findings of a gate, and the rounds and runs that they took.
 
     Attributes:
         findings: What both sides show.
@@ -443,7 +443,7 @@ def _checked(
     guarded = gate.config.guardrails
     times_count = guarded.frame_time is not None or guarded.memory is not None
 
-    # equality first
+    # one round first: a change that keeps every trajectory to the bit needs no more
     first = _started(
         stack, "first" if again and times_count else CANDIDATE, gate.folder, gate, place
     )
@@ -653,7 +653,7 @@ def _result(
     place: Path,
     notes: list[str],
 ) -> GateResult:
-    """What was found, in words and numbers."""
+    """The findings as a `GateResult`, in words and numbers."""
     findings = outcome.findings
     estimate = findings.estimate
     result = GateResult(

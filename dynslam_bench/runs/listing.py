@@ -77,7 +77,7 @@ def _parsed_row(run_id: str, text: str) -> Row | None:
 
 @dataclass(frozen=True)
 class Rescored:
-    """What scoring all runs of a store again has changed.
+    """Runs whose metrics changed when all runs of a store were scored again.
 
     Attributes:
         protocol: Id of the protocol.

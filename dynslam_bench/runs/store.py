@@ -532,7 +532,7 @@ class RunStore:
     def _inputs(
         self, record: RunRecord, protocol: Protocol, which: TrajectoryKind
     ) -> tuple[Trajectory, Trajectory, NDArray[np.float64] | None]:
-        """What one of a run's trajectories is evaluated with.
+        """Inputs of the evaluation of one of a run's trajectories.
 
         Returns:
             The trajectory, the ground truth, and the stamps of all input frames in seconds; None in
@@ -695,7 +695,7 @@ def score(
 
 @dataclass(frozen=True)
 class Merged:
-    """What `copying.merge` did.
+    """Runs that `copying.merge` copied, that were stored already, and that it left out.
 
     Attributes:
         added: Ids of the runs that were copied.

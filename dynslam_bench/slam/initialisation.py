@@ -469,7 +469,7 @@ class InitialMap:
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
-        # two keyframes
+        # both views become keyframes; the second one's pose follows from the measured motion
         T_second_world = self.motion.T_second_first @ T_first_world
         slots: list[int] = []
         for view, pose in ((self.first, T_first_world), (self.second, T_second_world)):

@@ -151,7 +151,7 @@ class SavedMap:
 
     Attributes:
         header: Where it comes from.
-        arrays: By name, see `KEYFRAME_ARRAYS` and those after it.
+        arrays: Arrays by name, see `KEYFRAME_ARRAYS` and those after it.
     """
 
     header: MapHeader
@@ -162,7 +162,7 @@ class SavedMap:
 
         Args:
             camera: The system's.
-            features: Those that it extracts.
+            features: The kind of features that the system extracts.
             sensors: ``rgbd`` or ``rgb``.
             file: For the message.
 
@@ -233,7 +233,7 @@ def read_map(path: Path) -> SavedMap:
     except DynslamError as error:
         raise SettingsError(str(error)) from error
 
-    # the tables
+    # refuse arrays that do not fit each other
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     fault = next(_faults(arrays, header), None)
     if fault is not None:
@@ -301,7 +301,7 @@ def _size_faults(arrays: Arrays) -> Iterator[str]:
         if not np.isfinite(arrays[name]).all():
             yield f"'{name}' holds values that are not finite"
 
-    # descriptors
+    # descriptors no longer than the matcher reads
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     if words > MAX_WORDS:
         yield f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"

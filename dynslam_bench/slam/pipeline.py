@@ -274,7 +274,7 @@ class SlamPipeline:
         return keypoints, xy
 
     def _filter_state(self, frame: FrameBundle) -> FilterState:
-        """What filters may read beside the frame: the previous frame, the prediction and the map."""
+        """State that filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
         T_world_pred, covariance = self._backend.predict_T_world_cam(frame.timestamp)
         keyframes, map_points = self._backend.view()
@@ -588,7 +588,7 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     current_points = camera.unproject(frame.xy[has_depth], frame.z[has_depth])
     points = current_points @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
 
-    # their projections
+    # where they appear in the previous image, unless they would lie behind its camera
     ahead = points[:, 2] > MIN_PREDICTED_DEPTH_M
     rows = np.flatnonzero(has_depth)[ahead]
     guess[rows] = camera.distort_points(camera.project(points[ahead]))

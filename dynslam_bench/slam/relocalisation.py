@@ -115,7 +115,7 @@ not connected with it: the camera was kidnapped."""
 CONNECTED = 20
 """Matches that must fit one homography to connect two images."""
 CONNECTED_SHARE = 0.4
-"""Their share of all matches, at least."""
+"""Least share of these matches among all."""
 HOMOGRAPHY_PX = 4.0
 """Largest error of these matches, pixels of octave 0."""
 ROTATION_SLACK = np.radians(20.0)
@@ -569,7 +569,8 @@ class RotationEstimate:
 
     Attributes:
         observations: Features of the newest image.
-        R_now_last: From the camera's axes in the last tracked frame to those of now, ``[3, 3]``.
+        R_now_last: Rotation ``[3, 3]`` from the camera's axes in the last tracked frame to those
+            now.
         apparent: Sum of the rotations between consecutive images, radians.
     """
 
@@ -627,7 +628,7 @@ class RotationEstimate:
 
         Args:
             T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
-            T_now_world: That of now.
+            T_now_world: World-to-camera pose ``[4, 4]`` now.
             more: How far the two worlds may be rotated against each other, radians.
         """
         difference = T_now_world @ se3.inverse(self.applied(T_last_world))

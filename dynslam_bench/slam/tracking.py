@@ -75,7 +75,7 @@ def observe_points(observations: Observations, features: Slots, points: Slots) -
 
     Args:
         observations: The frame's N features.
-        features: Those that observe a point, ``[M]``.
+        features: Indices of the features that observe a point, ``[M]``.
         points: Slots of their points, ``[M]``; -1 for none.
     """
     observed = np.full(len(observations), -1, np.int64)

@@ -69,9 +69,9 @@ def ranking_entries(
     successes lead to its first failure.
 
     Args:
-        board: Of the category.
-        whole: Of all sequences: the numbers of trackers.
-        boards: Of all categories, for the column that shows them side by side.
+        board: Board of the category.
+        whole: Board of all sequences, which numbers the trackers.
+        boards: Boards by category, for the column that shows them side by side.
         paged: Ids of the runs that have a page.
         monocular: Boards of trackers whose scale comes from the truth, by category.
     """
@@ -268,7 +268,7 @@ def board_data(
 
     Args:
         board: The board.
-        boards: Of its categories.
+        boards: Boards of its categories, by category.
         protocol: How errors were computed.
         paged: Ids of the runs that have a page.
         pictured: Ids of those whose pictures lie beside it.

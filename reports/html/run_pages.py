@@ -59,7 +59,7 @@ _NO_STAGES = ("total_s", "processor_s", "read_s")
 
 @dataclass(frozen=True)
 class RunPage:
-    """What the report needs of a run whose page was written.
+    """Entry in the report for a run whose page was written.
 
     Attributes:
         variant_key: Its tracker and settings.
@@ -436,7 +436,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
 
 
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
-    """What else is known of a run: name and text."""
+    """Rows (name, text) of the table of further numbers on a run's page; missing ones are left out."""
     # name, value, factor to the unit that is shown, unit
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
@@ -583,7 +583,7 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         whole = truth or estimate
         start = 0.0 if whole is None else float(whole.timestamps[0])
 
-    # the true path
+    # curves of the true path, in seconds since the start
     series: Series = {}
     if truth is not None and len(truth) > 1:
         drawn = _truth_of_run(row, truth)

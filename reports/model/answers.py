@@ -35,7 +35,7 @@ class TypicalError:
         median_m: Median over its sequences of the median error of each, in metres; None without
             any. A lost run counts as a static camera, or worse.
         sequences: Sequences with an error.
-        lost: Those of them that it lost.
+        lost: Sequences with an error that it lost.
         asked: Sequences that there are.
     """
 

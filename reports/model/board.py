@@ -103,7 +103,7 @@ class Board:
             known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
-        common: Those of them that the standings are taken over, each recording once.
+        common: Sequences that the standings are taken over, each recording once.
         copies: Sequence to the one before it whose true path it has: the same recording, by
             another name or with other pixels.
         short: Sequence to what is left of its name without the parts that all share.
@@ -299,26 +299,42 @@ class Board:
 
         Returns:
             One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``.
-            ``string`` columns: run_id, kind (``run here``, ``imported``), tracker, label, settings
-            (what sets the variant apart, ``name=value; ...``), provenance, sequence (name of the
-            column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
-            study (of which the run is a trial), protocol_id, protocol_digest, trajectory
-            (``online``, ``final``: whose errors they are), segmentation, computer (on which the
-            times were taken), program_remark (how many programs share the row, or how the results
-            differ from those of the program that ranks).
-            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed,
-                n_tracked.
-            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache),
-                seen_in_training
-            (whether the masks come from a network that was trained on the scene). ``Float64``:
-            coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks:
-            lost frames held, failures as a static camera or worse), hold_last_pose_ate_m,
-            final_ate_m and static_camera_ate_rmse_m (metres), frame_ms (median, milliseconds),
-            real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
-            (standard error in degrees of the alignment's rotation; above 10 the metrics
-            ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under its
-            own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see
-            `Evaluation`).
+
+            ``string`` columns:
+
+            - run_id, frames, split, repeat, status, segmentation, protocol_id, protocol_digest,
+              provenance, tracker, label;
+            - kind: ``run here`` or ``imported``;
+            - settings: what sets the variant apart, ``name=value; ...``;
+            - sequence: name of the column in tables; column_id: its key;
+            - ending: how a failed run ended;
+            - study: the study of which the run is a trial;
+            - trajectory: ``online`` or ``final``, whose errors they are;
+            - computer: where the times were taken;
+            - program_remark: how many programs share the row, or how the results differ from those
+              of the program that ranks.
+
+            ``Int64`` columns: seed, offset, noise (missing for the sequence's own), n_frames,
+            n_processed, n_tracked.
+
+            ``boolean`` columns:
+
+            - ranked, failed;
+            - cached: whether stage times come from the stage cache;
+            - seen_in_training: whether the masks come from a network that was trained on the scene.
+
+            ``Float64`` columns:
+
+            - coverage and epipolar_skipped: shares, 0 to 1;
+            - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
+              or worse;
+            - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
+            - frame_ms: median, milliseconds;
+            - real_time_factor; peak_memory_mb: MB; mask_iou: 0 to 1;
+            - rotation_uncertainty_deg: standard error in degrees of the alignment's rotation; above
+              10 the metrics ``ape_rot_*`` say nothing of the tracker;
+            - every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
+              ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
         """
         # column to its type: those that all frames have, then the metrics
         metrics = sorted(
@@ -441,7 +457,7 @@ def category_boards(board: Board) -> dict[str, Board]:
 
 def _fill_board(board: Board) -> Board:
     """Fill a board that has rows and labels: sequences, cells, ranking, reference, standings and order."""
-    # cells
+    # one cell for each tracker and sequence
     _order_sequences(board)
     by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
     board.cells = {
@@ -450,7 +466,7 @@ def _fill_board(board: Board) -> Board:
     }
     board.final_only = [key for key in board.labels if all(map(_has_final_only, board.runs(key)))]
 
-    # ranking
+    # who is ranked, beside which reference, and in which order
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
@@ -503,7 +519,7 @@ def rank(
     Args:
         board: Gives cells and reference.
         scored: Trackers to place.
-        ranked: Those of them that are ranked.
+        ranked: Trackers among `scored` that are ranked.
         score: Error of a run in metres, or None to leave it out.
     """
     # errors in metres of every tracker, by sequence
@@ -640,13 +656,13 @@ class TrackerPair(NamedTuple):
 
     Attributes:
         one: Variant key of the first tracker.
-        other: That of the second.
+        other: Variant key of the second tracker.
         ratio: Geometric mean of the errors of the first over those of the second where both succeed; over all
             sequences where they succeed on none together.
         sequences: Sequences behind it.
         lost: Sequences that the first alone lost, and the second alone.
         p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
-        verdict: Of the first; empty unless both are ranked.
+        verdict: What the test says of the first tracker; empty unless both are ranked.
         scope: How far that goes.
     """
 
@@ -868,7 +884,7 @@ class TrackerOnSequence:
 
     Attributes:
         rows: The runs, ordered by repeat.
-        kept: Those that count: of runs that differ in their seed only and have equal results, one.
+        kept: Runs that count: of runs that differ in their seed only and have equal results, one.
     """
 
     rows: tuple[RunRow, ...]
@@ -1002,7 +1018,7 @@ def missing_note(board: Board) -> str:
         why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
         sentences.append(f"Not ranked, since they {why}: {incomplete}.")
 
-    # the missing cells
+    # name the cells that are missing
     cells = []
     for key, names in list(missing.items())[:_MOST_MISSING]:
         others = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -1108,10 +1124,10 @@ def load_frame(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        trials: As in `build_report`.
+        trials: Whether the trials of studies count like other runs.
 
     Returns:
-        As `Board.frame`.
+        One line a run, with the columns of `Board.frame`.
 
     Raises:
         ReportError: There are no runs.
@@ -1133,13 +1149,14 @@ def load_board(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        reference: As in `make_board`.
-        on: As in `make_board`.
-        rank_seen: As in `make_board`.
-        trials: As in `build_report`.
+        reference: Tracker id that errors are divided by, see `make_board`.
+        on: Which sequences the ranking is taken over: ``common`` or ``all``, see `make_board`.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks
+            was trained on.
+        trials: Whether the trials of studies count like other runs.
 
     Raises:
-        ReportError: As `make_board`.
+        ReportError: There are no rows, they mix protocols, or no run is of the reference.
     """
     loaded = load_runs(open_stores(results), get_protocol(protocol), trials=trials)
     return make_board(loaded.rows, reference, on, rank_seen=rank_seen)

@@ -123,17 +123,17 @@ def load_for_report(
     Runs of monocular trackers are scored under its variant with Sim(3) alignment.
 
     Args:
-        stores: As in `load_runs`.
-        protocol: As in `load_runs`.
-        on_progress: As in `load_runs`.
-        pool: As in `load_runs`.
-        trials: As in `load_runs`.
+        stores: The stores.
+        protocol: How to evaluate.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
+        pool: Workers that score the runs; None to score them here.
+        trials: Whether the trials of studies count like other runs.
 
     Returns:
         The runs, and the protocol that they are scored under.
 
     Raises:
-        ReportError: As `load_runs`.
+        ReportError: There is no run at all.
     """
     scaled = PROTOCOLS.get(f"{protocol.id}-sim3")
     try:
@@ -181,7 +181,7 @@ def load_runs(
     Args:
         stores: The stores.
         protocol: How to evaluate.
-        on_progress: As in `build_report`.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
         pool: Workers that score the runs; None to score them here.
         trials: Whether trials of studies count like other runs.
 

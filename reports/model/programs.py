@@ -21,7 +21,7 @@ from dynslam_bench.runs.validity import Installation
 FEWEST_EQUAL = 5
 """Results that two programs must have in common, and all equal, to share a row."""
 CLOCKS_DIFFER = timedelta(minutes=10)
-"""By so much the clocks of two machines may differ. What started later than that lies in the future."""
+"""Largest difference between the clocks of two machines. A run that started later than that lies in the future."""
 CODE = "code"
 LIBRARIES = "libraries"
 WEIGHTS = "weights"

@@ -133,13 +133,13 @@ class RunRow(RunRecord):
 
     @property
     def repeat_key(self) -> tuple[int, int, int, str]:
-        """Which repeat of its cell it is; every imported file is one of its own."""
+        """Key of the repeat within its cell: offset, noise and seed; every imported file is a repeat of its own."""
         noise = -1 if self.sequence.noise is None else self.sequence.noise
         return self.offset, noise, self.seed, self.run_id if self.imported else ""
 
     @property
     def repeat(self) -> str:
-        """Which repeat it is, in words, e.g. ``seed 0, offset 2``.
+        """The repeat in words, e.g. ``seed 0, offset 2``.
 
         Of an import it is the end of its id, which tells files apart.
         """
@@ -274,10 +274,10 @@ def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
 
 
 class ReportData(Record):
-    """What a report was made of, as it lies beside it; `compare` reads it back.
+    """Rows and protocol of a report, stored beside it; `compare` reads them back.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         title: Title of the report.
         protocol: Description of the protocol.
         reference: Tracker that errors are divided by.
@@ -405,7 +405,7 @@ def _outcome(
 def _static_camera_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
-    """What a static camera scores under the protocol's alignment; None without ground truth."""
+    """ATE in metres of a static camera under the protocol's alignment; None without ground truth."""
     if evaluation is not None:
         return evaluation.metrics["static_camera_ate_rmse_m"]
     with suppress(DynslamError):

@@ -58,7 +58,7 @@ class Sequences(NamedTuple):
     """The sequences of a board, in one order.
 
     Attributes:
-        names: Their names ``[S]``.
+        names: Names of the sequences ``[S]``.
         families: The family of each ``[S]``.
         weights: Weight of each family.
     """
@@ -88,7 +88,7 @@ class Sequences(NamedTuple):
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a tracker stands.
+    """Standing of a tracker on a board: its errors beside the reference, rank and verdict.
 
     Attributes:
         key: The tracker.
@@ -122,7 +122,7 @@ class Standing:
 
 
 class RankingClaim(NamedTuple):
-    """What is claimed of a tracker beside the reference; fields as in `Standing`."""
+    """A claim on a tracker beside the reference; fields as in `Standing`."""
 
     verdict: RankingVerdict
     scope: Scope = ""
@@ -240,8 +240,8 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     families alone where their scatter has `FEWEST_FREE` degrees of freedom, else there is none.
 
     Args:
-        log_ratios: Their logarithms ``[S]``.
-        sequences: Their sequences.
+        log_ratios: Natural logarithms of the ratios ``[S]``.
+        sequences: Sequences of the ratios.
     """
     tested = sequences.test(log_ratios)
     mean = float(np.exp(tested.centre))
@@ -262,7 +262,7 @@ class PairTest(NamedTuple):
     """Two trackers on the sequences where both succeed, and what they lost.
 
     Attributes:
-        test: Of the log ratios of the first to the second.
+        test: Test of the log ratios, first over second.
         lost: Sequences that the first alone lost, and the second alone.
     """
 
@@ -284,8 +284,8 @@ def pair_test(log: Array, other: Array, sequences: Sequences) -> PairTest:
     """Compare two trackers; with fewer than `FEWEST` sequences where both succeed only their losses tell.
 
     Args:
-        log: Log errors of the first ``[S]``; nan where it lost.
-        other: Those of the second.
+        log: Log errors of the first tracker ``[S]``; nan where it lost.
+        other: Log errors of the second tracker ``[S]``; nan where it lost.
         sequences: The sequences.
     """
     differences = log - other
@@ -314,10 +314,10 @@ def claims_against(
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
-        lost: Tracker to which sequences it lost ``[S]``.
-        base_lost: Which the reference lost.
+        lost: Tracker to which sequences it lost, bool ``[S]``.
+        base_lost: Which sequences the reference lost, bool ``[S]``.
     """
     claims = dict.fromkeys(logs, RankingClaim("cannot tell"))
     others = [key for key, log in logs.items() if not np.array_equal(log, base)]
@@ -359,11 +359,11 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
 
     Args:
         logs: Ranked trackers to the logarithms of their median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
 
     Returns:
-        Of a typical (median) tracker; 1 where nothing can be shown.
+        Both differences of a typical (median) tracker; 1 where nothing can be shown.
     """
     others = [log for log in logs.values() if not np.array_equal(log, base)]
     tests = [sequences.test(log - base) for log in others]
@@ -387,7 +387,7 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
 
 
 class PairwiseResult(NamedTuple):
-    """Which of two trackers is better.
+    """Result of the test of one tracker against another.
 
     Attributes:
         first_by: Below 0 where the first is shown to be better, above 0 where the second is, else 0.
@@ -405,10 +405,10 @@ def separable(
 ) -> dict[tuple[str, str], PairwiseResult]:
     """Which trackers the sequences tell apart, Holm-corrected over all pairs.
 
-    The order of all pairs that are called separable is right together with a chance of at least 95
-    %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two trackers are
-    compared where both succeed. Who is better there and lost more sequences is not called better; who lost
-    more beyond chance (McNemar's exact test) is worse.
+    The order of all pairs that are called separable is right together with a chance of at least
+    95 %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two
+    trackers are compared where both succeed. A tracker that is better there and lost more sequences
+    is not called better; one that lost more beyond chance (McNemar's exact test) is worse.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of
@@ -467,7 +467,7 @@ def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
     """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
 
     Args:
-        logs: As in `separable`.
+        logs: Tracker to the logarithms of its median errors ``[S]``; nan where it lost.
 
     Returns:
         The p value of all trackers being alike, and the difference above which two mean ranks are

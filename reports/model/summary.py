@@ -200,7 +200,7 @@ def reservations(rows: Sequence[RunRow]) -> list[str]:
     if any(row.sequence.id.startswith("synthetic/") for row in rows):
         sentences.append("Rendered scenes: not comparable with recordings.")
 
-    # times
+    # reservations on times
     if any(row.cached for row in rows):
         sentences.append("Frame times come from the stage cache, not from the runs.")
     computers = {row.computer for row in rows if row.frame_ms is not None}

@@ -505,7 +505,7 @@ def computer_words(computer: str) -> str:
 
 
 def computer_note(board: Board) -> str:
-    """On which computer times were taken, and that some are of others; empty where all are of one."""
+    """A note on the computer on which times were taken, and that some are of others; empty where all are of one."""
     ended = [row for row in board.rows if not row.failed]
     others = {row.computer for row in timed(ended)} - {board.timing_computer}
     if not others:

@@ -523,7 +523,7 @@ def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray
 
 @pytest.mark.parametrize("seed", range(EPISODES))
 def test_losing_a_tracked_frame_raises_no_frames_reward(seed: int) -> None:
-    """Of every frame but the one that begins the frame of reference, alone, and from it on to the end."""
+    """Every frame but the one that begins the frame of reference is lost, alone, and from it on to the end."""
     truth, poses, tracked = episode(seed)
     earned = rewards("neg_pose_error", truth, poses, tracked)
     for frame in range(int(np.argmax(tracked)) + 1, len(poses), 5):

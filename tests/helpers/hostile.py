@@ -137,7 +137,7 @@ class Hostile:
 
 
 def alive(pids: list[int]) -> list[int]:
-    """Those that still run; a zombie does not."""
+    """The processes that still run; a zombie does not."""
     running = []
     for pid in pids:
         with contextlib.suppress(psutil.NoSuchProcess):

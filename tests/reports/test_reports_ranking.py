@@ -234,7 +234,7 @@ SIZES = {
 
 @pytest.fixture(scope="module")
 def boards():
-    """Of all sequences, and of each category."""
+    """The board of all sequences, and one of each category."""
     return category_boards(make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6})))
 
 

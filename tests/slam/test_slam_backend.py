@@ -312,7 +312,7 @@ def strolling(room):
     ],
 )
 def test_both_ends_of_a_range_give_other_results(room, name, ends, frames, others):
-    """Of the settings that short episodes do not show."""
+    """Settings that short episodes do not show."""
     results = [track_all(make_backend(room, **others, **{name: end}), frames(room)) for end in ends]
     one, other = (
         [(r.state, r.keyframe, np.nan_to_num(r.T_world_cam).tobytes()) for r in run]
