@@ -109,8 +109,9 @@ class EpisodeState:
     """A copy of an episode in its middle, made by `SlamEnv.clone_state`; it can be restored any number of times.
 
     Attributes:
-        origin: What it is of: sequence, tracker, control, settings and version of this package.
-        parts: The copied attributes.
+        origin: Description by name of everything that it depends on: sequence, tracker, control,
+            settings, reward, protocol, `lost_after` and version of this package.
+        parts: Copies of the environment's attributes that belong to the episode, by name.
     """
 
     origin: Mapping[str, str]
@@ -191,11 +192,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
-    """An environment's own has the frame rate of its sequence, stride included."""
+    """Each environment has its own, with the frame rate of its sequence, stride included."""
     sequence: FrameSequence
     """The frames of the episode."""
     window: tuple[int, int]
-    """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
+    """The episode's frames in the sequence as it was opened: the first, and one past the last."""
 
     @names_wrong_arguments
     def __init__(
@@ -225,6 +226,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         given = {
             name: value for name, value in locals().items() if name not in ("self", "__class__")
         }
+        # EzPickle keeps the arguments: unpickling makes the environment again
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
         if render_mode not in (None, "rgb_array"):
             raise SettingsError(f"unknown render mode '{render_mode}'", "choose rgb_array")
@@ -259,7 +261,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             stride=stride,
             memory_map=memory_map,
         )
-        # a string is no list of names: `ActionMap` refuses it by its text
+        # a text stays one: `ActionMap` refuses it by what the user wrote, not by its letters
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
 
@@ -271,7 +273,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.action_space = self._actions.space()
         self.observation_space = observation_space(observation, self.sequence.camera)
 
-        # the episode
+        # no episode has begun before the first `reset`
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Canvas | None = None
@@ -478,7 +480,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.sequence = _frames_of_window(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
-        """What an episode's state depends on, in words; equal where it can be restored."""
+        """Description of everything an episode's state depends on; equal where the state can be restored."""
         whole = self._whole
         frames = digest([whole.digest(), content_digest(whole.timestamps)])
         return {
@@ -636,7 +638,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             if preprocessing_of(self.settings) != preprocessing:
                 options = {"sequence": self._source, **options}
 
-        # sequence
+        # another sequence has to fit the observation space, which cannot change
         if "sequence" in options:
             self._use_sequence(options["sequence"])
             size = (camera.width, camera.height)
@@ -706,7 +708,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SequenceError: The frame cannot be read, or does not fit the sequence's camera.
             TrackerContractError: The tracker broke its contract.
         """
-        # read
+        # read the frame, with the user's transforms
         index = self.episode.next_index
         read_start = time.perf_counter()
         self._final = None
@@ -715,7 +717,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             frame = transform(frame)
         frame = read_only(frame)
 
-        # track
+        # track it, with wall-clock and processor time; errors inside count as the tracker's
         track_start = time.perf_counter()
         processor_start = time.process_time()
         with tracker_code():
@@ -781,7 +783,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
 
 def _frames_of_window(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
-    """The frames of a window."""
+    """The frames ``window[0]`` to ``window[1] - 1`` of a sequence, as a view."""
     if window == (0, len(whole)):
         return whole
     return cast("FrameSequence", SequenceView(whole, *window))

@@ -47,7 +47,7 @@ from dynslam_bench.reports.model.answers import (
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
-    On,
+    RankingBasis,
     category_boards,
     copies_note,
     make_board,
@@ -55,7 +55,7 @@ from dynslam_bench.reports.model.board import (
     missing_note,
 )
 from dynslam_bench.reports.model.load import (
-    Loaded,
+    LoadedRuns,
     OnProgress,
     load_for_report,
     no_progress,
@@ -133,7 +133,7 @@ Fact = tuple[str, str, list[str]]
 
 @dataclass(frozen=True)
 class _Content:
-    """What a report shows, before it is written.
+    """Content of a report before it is written.
 
     Attributes:
         title: Heading.
@@ -181,7 +181,7 @@ def build_report(
     *,
     protocol: Protocol | str = "tum-rgbd/v1",
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     rank_seen: bool = False,
     trials: bool = False,
     most_pages: int | None = None,
@@ -286,11 +286,11 @@ def build_report(
 
 
 def _least_errors(board: Board) -> dict[str, LeastError]:
-    """The least median error of a ranked tracker on every sequence, by `RunRow.column_id`."""
+    """The least median error of a ranked tracker on every sequence, by `RunRow.sequence_key`."""
     least: dict[str, LeastError] = {}
     for row in board.rows:
         name = board.sequence(row)
-        if row.column_id in least:
+        if row.sequence_key in least:
             continue
         errors = []
         for key in board.ranked:
@@ -299,16 +299,16 @@ def _least_errors(board: Board) -> dict[str, LeastError]:
             if error_m is not None:
                 errors.append((error_m, board.labels[key]))
         if errors:
-            least[row.column_id] = LeastError(*min(errors))
+            least[row.sequence_key] = LeastError(*min(errors))
     return least
 
 
-def _monocular_boards(loaded: Loaded, boards: Mapping[str, Board]) -> dict[str, Board]:
+def _monocular_boards(loaded: LoadedRuns, boards: Mapping[str, Board]) -> dict[str, Board]:
     """Category to the board of the monocular trackers that were run on its sequences."""
     apart = {}
     for category, part in boards.items():
-        columns = {row.column_id for row in part.rows}
-        rows = [row for row in loaded.monocular if row.column_id in columns]
+        columns = {row.sequence_key for row in part.rows}
+        rows = [row for row in loaded.monocular if row.sequence_key in columns]
         if category == OVERALL:
             rows = loaded.monocular
         if rows:
@@ -324,7 +324,7 @@ def pages_for(runs: int, typical: int) -> int:
 
     Args:
         runs: Runs of the report.
-        typical: Those of them with the median error of their cell.
+        typical: Runs among them that have the median error of their cell.
     """
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
@@ -429,7 +429,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         rows=content.board.rows,
     ).write(paths.data)
 
-    # the pages
+    # write the pages of the report
     write_assets(output)
     write_atomic(paths.html, _first_page(content, facts, footer))
     for page in content.sections:
@@ -623,7 +623,7 @@ _MOST_COMMANDS = 200
 """Commands that are shown."""
 
 
-def _board_notes(board: Board, loaded: Loaded) -> list[str]:
+def _board_notes(board: Board, loaded: LoadedRuns) -> list[str]:
     """What a reader has to know about the ranking of a category: gaps, and what is not ranked."""
     notes = [missing_note(board), copies_note(board)]
     if board.final_only:
@@ -639,7 +639,7 @@ def _board_notes(board: Board, loaded: Loaded) -> list[str]:
     return [note for note in notes if note]
 
 
-def _common_notes(protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
+def _common_notes(protocol: Protocol, loaded: LoadedRuns, pageless: str) -> list[str]:
     """What a reader has to know about all categories: contradictions, and what is left out."""
     notes = []
     if loaded.conflicts:
@@ -661,7 +661,7 @@ def _common_notes(protocol: Protocol, loaded: Loaded, pageless: str) -> list[str
     return [note for note in notes if note]
 
 
-def _left_out_note(loaded: Loaded) -> str:
+def _left_out_note(loaded: LoadedRuns) -> str:
     """How many runs are in no table, by reason; empty for none."""
     left_out = {
         "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
@@ -672,7 +672,7 @@ def _left_out_note(loaded: Loaded) -> str:
     return f"Left out: {counts}." if counts else ""
 
 
-def _program_notes(board: Board, loaded: Loaded) -> list[str]:
+def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
     """What is to be said where several programs made runs of one tracker."""
     notes = []
     others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
@@ -803,7 +803,7 @@ def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
     return Section("share", "Error against the share of people", blocks=blocks)
 
 
-def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
+def provenance_section(board: Board, loaded: LoadedRuns, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs.
 
     Args:
@@ -811,7 +811,7 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
         loaded: What was read from the stores.
         again: The command that makes this report again.
     """
-    # commands
+    # commands that made the runs, each once
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     codes = {
@@ -898,7 +898,7 @@ class Site:
     Attributes:
         index: Its first page.
         files: How many files it has.
-        size_mb: Their size in MB.
+        size_mb: Size of all files in MB.
     """
 
     index: Path
@@ -931,9 +931,10 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
-        most_pages: As in `build_report`; a page takes about 30 kB.
-        most_pictures: As in `build_report`; the pictures of a run take about 0.4 MB.
-        on_progress: As in `build_report`.
+        most_pages: Runs that have a page of their own, see `build_report`; a page takes about 30 kB.
+        most_pictures: Runs whose pictures are shown, see `build_report`; the pictures of a run take
+            about 0.4 MB.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
         ReportError: There are no runs, or the folder of a study holds no page.

@@ -226,41 +226,15 @@ def error_figure(board: Board) -> go.Figure | None:
     for key in [*board.trackers, *board.final_only]:
         present = [name for name in names if name in board.cells[key]]
         cells = {name: board.cells[key][name] for name in present}
-        errors_m = {name: error for name in present if (error := cell_error_m(cells[name]))}
-        if not errors_m:
+        errors_mm = {
+            name: 1000.0 * error for name in present if (error := cell_error_m(cells[name]))
+        }
+        if not errors_mm:
             continue
         line = wrapped(board.names[key])
         lines.append(line)
-        is_open = key not in board.ranked
-        symbols = [
-            "x" if cells[name].lost else look[key]["symbol"] + "-open" * is_open
-            for name in errors_m
-        ]
-        traces.append(
-            go.Scatter(
-                x=rounded([1000.0 * error for error in errors_m.values()]),
-                y=[line] * len(errors_m),
-                mode="markers",
-                marker={"size": 9, "color": look[key]["color"], "symbol": symbols},
-                customdata=[run_link(cells[name].typical) for name in errors_m],
-                text=[safe(board.short.get(name, name)) for name in errors_m],
-                hovertemplate="%{text}<br>%{x:.4g} mm<extra></extra>",
-            )
-        )
-        traces.append(
-            go.Scatter(
-                x=rounded([1000.0 * float(np.median(list(errors_m.values())))]),
-                y=[line],
-                mode="markers",
-                marker={
-                    "size": 20,
-                    "color": look[key]["color"],
-                    "symbol": "line-ns",
-                    "line": {"width": 3, "color": look[key]["color"]},
-                },
-                hovertemplate="median %{x:.4g} mm<extra></extra>",
-            )
-        )
+        traces.append(_error_points(board, key, line, errors_mm, look[key]))
+        traces.append(_median_bar(line, float(np.median(list(errors_mm.values()))), look[key]))
     figure = figure_of(
         traces,
         110 + 30 * len(lines),
@@ -273,24 +247,81 @@ def error_figure(board: Board) -> go.Figure | None:
             "range": [-1.0, len(lines) - 0.5],
         },
     )
+
+    # a guide where a camera that does not move stands
     static_m = [board.static_camera[name] for name in names if board.static_camera[name] > 0]
     if figure is not None and static_m:
-        static_mm = 1000.0 * float(np.median(static_m))
-        # an invisible point on the line: axes are fitted to points, not to lines
-        blank = go.Scatter(x=[static_mm], y=lines[:1], mode="markers", opacity=0, hoverinfo="skip")
-        figure.add_trace(blank)
-        figure.add_vline(static_mm, **GUIDE)
-        # annotations on a logarithmic axis take the logarithm of their place
-        figure.add_annotation(
-            x=float(np.log10(static_mm)),
-            y=0.0,
-            yref="paper",
-            text="not moving",
-            xanchor="right",
-            yanchor="bottom",
-            showarrow=False,
-        )
+        _add_static_camera(figure, 1000.0 * float(np.median(static_m)), lines[:1])
     return figure
+
+
+def _error_points(
+    board: Board, key: str, line: str, errors_mm: Mapping[str, float], look: Mapping[str, str]
+) -> go.Scatter:
+    """A point for each error of a tracker.
+
+    Args:
+        board: The board.
+        key: Variant key of the tracker.
+        line: Its line in the figure.
+        errors_mm: Error in millimetres by sequence.
+        look: Its colour and symbol.
+    """
+    cells = board.cells[key]
+    symbol = look["symbol"] if key in board.ranked else f"{look['symbol']}-open"
+    return go.Scatter(
+        x=rounded([*errors_mm.values()]),
+        y=[line] * len(errors_mm),
+        mode="markers",
+        marker={
+            "size": 9,
+            "color": look["color"],
+            "symbol": ["x" if cells[name].lost else symbol for name in errors_mm],
+        },
+        customdata=[run_link(cells[name].typical) for name in errors_mm],
+        text=[safe(board.short.get(name, name)) for name in errors_mm],
+        hovertemplate="%{text}<br>%{x:.4g} mm<extra></extra>",
+    )
+
+
+def _median_bar(line: str, median_mm: float, look: Mapping[str, str]) -> go.Scatter:
+    """A bar across a tracker's line at the median of its errors, millimetres."""
+    return go.Scatter(
+        x=rounded([median_mm]),
+        y=[line],
+        mode="markers",
+        marker={
+            "size": 20,
+            "color": look["color"],
+            "symbol": "line-ns",
+            "line": {"width": 3, "color": look["color"]},
+        },
+        hovertemplate="median %{x:.4g} mm<extra></extra>",
+    )
+
+
+def _add_static_camera(figure: go.Figure, static_mm: float, first_line: list[str]) -> None:
+    """Draw the median error of a camera that does not move, with a label at the bottom.
+
+    Args:
+        figure: The figure.
+        static_mm: Error of a static camera, millimetres.
+        first_line: The first line of the figure, in a list of one.
+    """
+    # an invisible point on the line: axes are fitted to points, not to lines
+    blank = go.Scatter(x=[static_mm], y=first_line, mode="markers", opacity=0, hoverinfo="skip")
+    figure.add_trace(blank)
+    figure.add_vline(static_mm, **GUIDE)
+    # annotations on a logarithmic axis take the logarithm of their place
+    figure.add_annotation(
+        x=float(np.log10(static_mm)),
+        y=0.0,
+        yref="paper",
+        text="not moving",
+        xanchor="right",
+        yanchor="bottom",
+        showarrow=False,
+    )
 
 
 def cumulative_figure(board: Board) -> go.Figure | None:
@@ -338,7 +369,7 @@ def cumulative_figure(board: Board) -> go.Figure | None:
 
 
 def _pareto_front(points: Collection[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those of some speeds and ratios that no other beats in both, the slowest first."""
+    """Points (speed, ratio) that no other point beats in both, the slowest first."""
     front = []
     for speed, ratio in points:
         others = [point for point in points if point != (speed, ratio)]

@@ -70,8 +70,8 @@ class SceneErrors(Record):
 
     Attributes:
         scene: The scene.
-        baseline_m: Of the baseline, in metres.
-        candidate_m: Of the candidate, in metres.
+        baseline_m: ATE of the baseline, metres.
+        candidate_m: ATE of the candidate, metres.
         lost_by_baseline: Whether the baseline lost at least half of its runs there.
         lost: Whether the candidate did.
     """
@@ -92,14 +92,16 @@ class Candidate(Record):
         values: What its trial had been worth.
         choice: Mean log ratio on the instances of the choice, which ranks the candidates; None
             without such instances.
-        confirm: Beside the baseline on the instances of the choice; where nothing is held out they
-            judge.
-        held_out: On the held-out instances; None without any, or if it is not the best.
+        confirm: Comparison with the baseline on the instances of the choice; where nothing is held
+            out they judge.
+        held_out: Comparison with the baseline on the held-out instances; None without any, or if it
+            is not the best.
         recorded: ATE on recordings, which is said and decides nothing; None without any, or if it is not the best.
         scene_errors: Its ATE and the baseline's in each scene that judges; empty where none judged.
-        beyond: By the means of the judging families that no trial saw; None for fewer than `FEWEST` of them.
+        beyond: Comparison by the means of the judging families that no trial saw; None for fewer
+            than `FEWEST` of them.
         on_confirm: ATE and processor time on the instances of the choice, by objective.
-        on_held_out: The same on the held-out instances.
+        on_held_out: ATE and processor time on the held-out instances, by objective.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
             errors.
         feasible: Whether the constraints hold in the new runs.
@@ -159,7 +161,7 @@ class Candidate(Record):
 
 
 class StudySummary(Record):
-    """What came out of a study; `summary.json` in its folder.
+    """Result of a study; `summary.json` in its folder.
 
     Attributes:
         name: The study.
@@ -174,8 +176,8 @@ class StudySummary(Record):
             ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
         tune: The instances that trials ran on.
-        confirm: Those of the choice; where nothing is held out they judged it.
-        held_out: Those that judged it.
+        confirm: The instances of the choice; where nothing is held out they judged it.
+        held_out: The held-out instances, which judged it.
         recorded: Recordings that the best one was run on at the end.
         seen: Splits with scenes that the network behind the masks was trained on, see
             `plan.seen_note`.
@@ -422,7 +424,7 @@ def next_step(
 
 
 def families_sentence(design: Design) -> str:
-    """On which families a study judges, and whether its trials saw other scenes of them."""
+    """A sentence on the families that a study judges on, and on whether its trials saw other scenes of them."""
     judging = _families(design.judging)
     tuned = _tuned_families(design)
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
@@ -445,9 +447,9 @@ def beyond_families(
     more is lost by it.
 
     Args:
-        comparison: Over scenes.
-        ratios: Log ratio by scene.
-        design: Of the study.
+        comparison: The comparison over all judging scenes.
+        ratios: Natural log of the error ratio by scene.
+        design: The study's design: which instances it runs on, and what for.
 
     Returns:
         None for fewer than `FEWEST` such families.
@@ -686,7 +688,7 @@ def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
 
 
 def _rank_by_choice(candidate: Candidate) -> tuple[bool, bool, float]:
-    """Those that ran and fulfil the constraints first, then by their value on the instances of the choice."""
+    """Sort key: candidates that ran and fulfil the constraints first, then by value on the instances of the choice."""
     value = math.inf if candidate.choice is None else candidate.choice
     return bool(candidate.failed), not candidate.feasible, value
 
@@ -711,7 +713,7 @@ def _run_again(
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
     tuned = [tuner.configuration(candidate.params) for candidate in candidates]
-    default = [] if tuner.shipped is None else [tuner.shipped]
+    default = [] if tuner.default_configuration is None else [tuner.default_configuration]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
         shipped[split] = compare(outcomes, baseline, objective=objective, one_sided=level)

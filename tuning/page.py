@@ -119,7 +119,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
 
 
 def _asked(tuner: Study, summary: StudySummary) -> str:
-    """What the study was asked, in words."""
+    """The question of the study, in words."""
     goals = " and ".join(objective.what for objective in tuner.objectives)
     trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
     design = tuner.design

@@ -15,7 +15,6 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import typer
-from pydantic_core import from_json, to_json
 
 from dynslam_bench.core import DynslamError, call_periodically, printable
 
@@ -122,6 +121,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
         Exit: Something was checked and is not `verified`; the code is 4.
     """
     if _json_mode:
+        from pydantic_core import from_json, to_json
+
         text = to_json(value, inf_nan_mode="null", fallback=_as_json)
         # `json.dumps` escapes what a terminal would execute
         sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")

@@ -312,7 +312,7 @@ def bench(
 
 
 def show_workers(rows: Sequence[dict[str, object]]) -> None:
-    """What each worker of a scheduler has, on standard error."""
+    """Show on standard error what each worker of a scheduler has."""
     if not rows:
         announce("the scheduler has no worker yet")
         return

@@ -192,7 +192,9 @@ def show(
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
-    present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
+    present(
+        {"record": record, "metrics": metrics, "folder": store.shown_folder(record.run_id)}, *lines
+    )
 
 
 @app.command()
@@ -354,7 +356,7 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
     identity = "unverified: its id does not tell the contents of data and code"
     return {
         "run": record.run_id,
-        "folder": store.place(record.run_id),
+        "folder": store.shown_folder(record.run_id),
         "identity": "" if record.verified else identity,
         "status": record.status,
         "reason": record.reason,
@@ -455,7 +457,10 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     """Show rows as `list_runs` gives them, as a table or JSON; the table has the columns in which a run has a value."""
     if json_mode():
         present(
-            [row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows]
+            [
+                row | {"protocol": protocol, "folder": store.shown_folder(row["run_id"])}
+                for row in rows
+            ]
         )
         return
     # columns without any value are left out

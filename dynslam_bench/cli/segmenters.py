@@ -57,7 +57,7 @@ def train(
 ) -> None:
     """Train a Mask R-CNN with a cross-layer feature pyramid; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.training.settings import TrainSettings
     from dynslam_bench.segmentation.training.train import train as train_network
 
@@ -96,7 +96,7 @@ def evaluate(
 ) -> None:
     """Measure a segmenter's masks against labels."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
@@ -138,7 +138,7 @@ def record(
 ) -> None:
     """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.record import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences import open_sequence

@@ -57,7 +57,7 @@ class FrameBundle:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeView:
-    """What a filter may see of a keyframe.
+    """The part of a keyframe that a filter may read.
 
     Attributes:
         T_world_cam: Camera-to-world pose ``[4, 4]``.
@@ -80,7 +80,7 @@ class KeyframeView:
 
 @dataclass(eq=False)
 class FilterState:
-    """What is known beside the frame itself, shared by all filters of a pipeline.
+    """Input of all filters of a pipeline beside the frame itself: poses, the previous frame, flow and the map.
 
     Attributes:
         camera: Intrinsics (with the raw images' distortion).

@@ -327,7 +327,7 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
 
 
 def _named(code: list[Path], others: list[Path]) -> list[Path]:
-    """Those of the other files that the code names; what they name in turn counts, too."""
+    """Files among `others` that the code names; what they name in turn counts, too."""
     files: list[Path] = []
     waiting = list(code)
     while waiting and others:

@@ -354,7 +354,7 @@ def git_revision() -> GitRevision | None:
 
 
 def _output_of(*command: str) -> str:
-    """What a command writes, without white space around it.
+    """The output of a command, without white space around it.
 
     Raises:
         OSError: It cannot be started.

@@ -73,7 +73,8 @@ class Reads(Record):
         modules: Where each module that was asked for was found, by its top-level name.
         distributions: Version and digest of the RECORD of each distribution whose modules were
             imported.
-        programs: The same of each file and folder that the processes of programs were made of.
+        programs: Digest of each file and folder that the processes of external programs were made
+            of: executables, libraries, and what their command lines name.
     """
 
     files: Entries = Field(default_factory=dict)
@@ -150,7 +151,7 @@ _DIGESTS: dict[tuple[str, str, int, int, int, int], str] = {}
 
 
 def remembered(kind: str, path: str, compute: Callable[[], str]) -> str:
-    """What is computed from a file, once in this process while the file's size, times and inode stay the same.
+    """A value that is computed from a file, once in this process while the file's size, times and inode stay the same.
 
     Raises:
         OSError: It is not there.
@@ -218,7 +219,7 @@ def value_digest(value: str | None) -> str:
 
 
 def search_now(name: str, environment: Mapping[str, str], base_folders: BaseFolders) -> str:
-    """What a search path holds, or which file a command is.
+    """The folders of a search path, or the file that a command runs.
 
     Args:
         name: An environment variable that holds a search path; or `COMMAND` and the command's name.
@@ -399,7 +400,7 @@ class Verifier:
 
     Args:
         path: The import path of the runs; None for that of this process.
-        environment: Their environment variables; None for those of this process.
+        environment: Environment variables of the runs; None for those of this process.
     """
 
     def __init__(
@@ -465,7 +466,7 @@ _SECTIONS = (
 
 
 def _in_words(section: str, name: str, before: str) -> str:
-    """What a user calls an entry of `Reads`."""
+    """A name in words for an entry of `Reads`."""
     short = re.sub("^(plugin|work):/", "", name)
     match section:
         case "search" if name.startswith(COMMAND):

@@ -348,7 +348,7 @@ def _group_class(field: FieldInfo) -> type[Settings] | None:
 
 
 def _annotation(field: FieldInfo, key: str) -> dict[str, Any] | None:
-    """What `tunable` or `names` stored with a field under a key; None where nothing is stored."""
+    """The value that `tunable` or `names` stored with a field under a key; None where nothing is stored."""
     extra = field.json_schema_extra
     if not isinstance(extra, dict):
         return None

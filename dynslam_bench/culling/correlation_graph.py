@@ -155,7 +155,8 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
 
         Args:
             current: World positions and covariances ``[N, 3 + 9]`` of this frame's points.
-            past: Those in the K frames before, newest first, ``[K, N, 3 + 9]``; NaN unobserved.
+            past: World positions and covariances of the same points in the K frames before, newest
+                first, ``[K, N, 3 + 9]``; NaN unobserved.
             observed: bool ``[K, N]``, in which of these each point was observed.
             edges: Pairs of points ``[E, 2]``.
         """

@@ -52,7 +52,8 @@ def fundamental_matrix(
 
     Args:
         x1: Undistorted pixels of the previous image, float64 ``[N, 2]``.
-        x2: Those of the current one that they are matched with, float64 ``[N, 2]``.
+        x2: Undistorted pixels of the current image, float64 ``[N, 2]``; row i is matched with row i
+            of `x1`.
         inlier_px: Distance in pixels up to which a match agrees with F.
         max_draws: Most samples that RANSAC draws.
         min_matches: Fewer matches give no F.
@@ -221,7 +222,7 @@ class EpipolarFilter(BaseFilter[EpipolarSettings]):
         flow_px = float(np.median(np.linalg.norm(x1 - x2, axis=1)))
         if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
-        # a plane
+        # one plane: a homography explains the matches as well, and F is not determined
         share = stats["homography_share"] = homography_share(x1, x2)
         return share > self.settings.homography_share
 

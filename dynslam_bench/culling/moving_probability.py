@@ -125,7 +125,7 @@ def expand(
 
     Args:
         xy: Pixels of all features ``[N, 2]``.
-        probability: Their moving probabilities ``[N]``.
+        probability: Moving probabilities of these features ``[N]``.
         linked: bool ``[N]``, which of them have a history.
         radius_px: Largest distance to that feature; its influence is a Gaussian of half this width.
 

@@ -129,7 +129,7 @@ def nearby_mean(
 
     Args:
         xy: Raw pixels of the points ``[N, 2]``.
-        z: Their depths ``[N]``, metres, 0 missing.
+        z: Depths of the points ``[N]``, metres, 0 missing.
         values: ``[N, K]``.
         at: Raw pixels ``[M, 2]``.
         at_z: Depths there ``[M]``, metres; where 0, points of any depth count.
@@ -182,7 +182,7 @@ def _fill_nearby_mean(
 def nearest_depth(
     depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Of the depths in the 3x3 patch around each raw pixel, the one closest to `expected`.
+    """The depth closest to `expected` in the 3x3 patch around each raw pixel.
 
     Thus depth edges and sub-pixel flow errors do not count as motion.
 

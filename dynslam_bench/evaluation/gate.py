@@ -31,7 +31,7 @@ MARGIN = 0.10
 
 
 class GateVerdict(str, Enum):
-    """What a gate says of the candidate's errors."""
+    """A gate's verdict on the candidate's errors."""
 
     IDENTICAL = "identical"
     IMPROVED = "improved"
@@ -98,7 +98,7 @@ def mean_ratio(ratios: ArrayLike, level: float | None = None) -> GateEstimate:
 
 
 def _degrees_of_freedom(variances: Array, rounds: int) -> float:
-    """Those of a mean over sequences whose variances ``[S]`` differ (Satterthwaite 1946).
+    """Degrees of freedom of a mean over sequences whose variances ``[S]`` differ (Satterthwaite 1946).
 
     One pooled variance claims falsely in 11.7 % of gates where one of eight sequences scatters, this in
     4.7 %, for one run a sequence more.

@@ -48,12 +48,12 @@ _TIE = 1e-12
 _MANY_TIES = math.sqrt(0.5)
 """Share of ties above which the pseudo-median is one: its square is the share of pairs of ties."""
 _WILCOXON_EFFICIENCY = 3.0 / math.pi
-"""Of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes (Pitman)."""
+"""Pitman's efficiency of the signed-rank test on normal values: it needs 1 / 0.955 times the scenes of the t test."""
 _MOST_SCENES = 100_000
 
 
 class Verdict(str, Enum):
-    """What a comparison says of the candidate."""
+    """A comparison's verdict on the candidate."""
 
     PROVEN = "proven"
     BUT_LOST = "smaller typical error, but lost"
@@ -82,7 +82,7 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> PseudoMed
 
     Args:
         log_ratios: One a scene, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
 
@@ -127,7 +127,7 @@ def interval_with_ties(log_ratios: ArrayLike, confidence: float = 0.90) -> Pseud
 
     Args:
         log_ratios: One a scene ``[S]``, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
     untied = values[np.abs(values) > _TIE]
@@ -175,7 +175,7 @@ class PairedRatio(Record):
         much_better: Scenes where the baseline has more than `CATASTROPHE` times the error.
         lost_both: Scenes that both lost.
         worst: The scene with the largest ratio; empty where `ratio` is None.
-        worst_ratio: That ratio; None likewise.
+        worst_ratio: Ratio of that scene; None where `ratio` is None.
         one_sided: Level of a claim.
         runs: Paired runs behind the scenes.
         lost_runs: How many of them the candidate lost, and the baseline, whether or not that lost a
@@ -399,7 +399,7 @@ def findings(
     Args:
         comparison: The candidate beside the baseline.
         subject: What to call the candidate, e.g. ``trial 7``.
-        margin: As `verdict_of` takes it.
+        margin: Differences below this share do not matter.
     """
     verdict = verdict_of(comparison, margin)
     sentences = [_claim(comparison, verdict, subject)]

@@ -40,12 +40,12 @@ class Findings(NamedTuple):
     """What both sides show after some rounds.
 
     Attributes:
-        verdict: On the error.
+        verdict: Verdict on the error.
         estimate: Mean log ratio with its interval; None where nothing could be compared.
         level: Two-sided level of the interval.
         lost: Runs that the candidate lost, and the baseline.
         cases: Every sequence.
-        guardrails: Those that were asked for.
+        guardrails: Every guardrail that the gate's file names.
         exit_code: See `GateResult`.
     """
 
@@ -107,7 +107,7 @@ def judge(
     ratios = log_ratios(errors, errors_baseline)
     estimate = mean_ratio(ratios[is_compared], level) if is_compared.any() else None
 
-    # the verdict
+    # equal trajectories first, then the interval against the margin; more lost runs overrule both
     verdict = GateVerdict.UNDECIDED
     all_lost = lost.all() or lost_baseline.all()
     if are_identical(baseline, candidate, cases, rounds) and not all_lost:

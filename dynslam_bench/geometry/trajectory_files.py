@@ -116,7 +116,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
     Raises:
-        TrajectoryError: As `load_tum`.
+        TrajectoryError: The file is missing or damaged, or holds no valid pose, see `load_tum`.
     """
     return load_tum(path).trajectory
 
@@ -176,7 +176,7 @@ def _stamps_of(
 
     Args:
         texts: The stamps as they are written ``[N]``.
-        values: Their numbers.
+        values: The stamps as numbers ``[N]``.
         source: The file.
         stated: The unit that its heading states; None where it states none.
         moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``;
@@ -371,7 +371,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _fields(line: str) -> list[str]:
-    """What stands in a line before a comment, split at commas and spaces."""
+    """The fields of a line, split at commas and spaces; a comment is left out."""
     return line.partition("#")[0].replace(",", " ").split()
 
 
@@ -396,7 +396,8 @@ def _read_table(
     """The rows of a table; `without` is the number of a line that is none of them.
 
     Raises:
-        TrajectoryError: As `read_table`.
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns`
+            numbers.
     """
     values = array("d")
     numbers = list[int]()

@@ -107,14 +107,14 @@ class StatedTrajectory(Record):
 
     Attributes:
         file: A trajectory in TUM's format: an address, or a path from the manifest's folder.
-        sha256: Of the file; empty where it is not known.
+        sha256: SHA-256 of the file, 64 hexadecimal digits; empty where it is not known.
         tracker: Name of the system that made it.
         label: Its name in tables.
         sequence: Id of the sequence.
         provenance: Where the file comes from; the address by default.
         which: Whether its poses are the causal ones or those after the final optimisation.
         truth: The ground truth, an address or a path, where the sequence's images are not here.
-        truth_sha256: Of the ground truth.
+        truth_sha256: SHA-256 of the ground truth's file, 64 hexadecimal digits.
     """
 
     model_config = ConfigDict(extra="forbid")

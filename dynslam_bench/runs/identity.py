@@ -32,8 +32,8 @@ from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import BaseFolders, ImportPath
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
-from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.own_code import (
@@ -80,7 +80,7 @@ class ResolvedRun:
         base_folders: The folders in which names of files begin that plug-ins and programs read.
         has_plugins_or_programs: Whether they take part; what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
-        files: Those that the tracker's command names, in the identity by their content.
+        files: Files that the tracker's command names; their content is part of the identity.
     """
 
     spec: RunSpec
@@ -180,14 +180,15 @@ class Resolver:
         added after its run.
 
         Raises:
-            DynslamError: As `resolve`.
+            DynslamError: A name of the request is not known, or a setting does not fit, see
+                `resolve`.
         """
         spec = spec.absolute()
         configured = self._configuration(spec)
         tracker = configured.tracker
         settings = configured.settings
 
-        # the frames
+        # open the sequence, cut to the frames asked for; refuse what the tracker cannot use
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
         sequence, part = self._opened_part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
@@ -301,7 +302,7 @@ def _asked(
     device: str,
     start_map: StartMap | None,
 ) -> dict[str, Any]:
-    """What of a run's identity was asked for: the entries `record.ASKED`."""
+    """The request in a run's identity: the entries `record.ASKED`."""
     settings = configured.flat
     if start_map is not None:  # its digest is among the weights
         settings = settings | {MAP_SETTING: ""}
@@ -425,9 +426,9 @@ def start_map_of(
 
     Args:
         settings: A tracker's complete settings.
-        camera: Of the sequence, as the tracker sees it.
-        sensors: Of the tracker.
-        digests: Of the files that the settings name, by the setting's name.
+        camera: Intrinsics of the sequence's images, as the tracker sees them.
+        sensors: Sensors that the tracker uses.
+        digests: Digests of the files that the settings name, by the setting's dotted name.
 
     Raises:
         SettingsError: The tracker has features of its own; the file is no map, or one of another

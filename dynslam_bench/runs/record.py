@@ -151,7 +151,8 @@ class StartMap(Record):
     """The map of an earlier run, in which a run began.
 
     Attributes:
-        digest: Of its content: runs that began in different maps are never repeats of each other.
+        digest: Digest of the map's content: runs that began in different maps are never repeats of
+            each other.
         file: Where it lay.
         made_by: Which run made it, in words.
         keyframes: Keyframes that it brought.
@@ -178,7 +179,7 @@ class RunRecord(Record):
     """The outcome of a run.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
         run_id: Digest of `identity`.
         status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`);
@@ -217,16 +218,16 @@ class RunRecord(Record):
             None for systems without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks
             of people; None where either is missing.
-        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``)
-            excluded; ``processor`` the processor time of the run's own process in it; ``detector``
-            is a network beside it.
+        timings: Times of the stages, by stage; ``total`` is the frame time: segmentation included,
+            decoding (``read``) excluded; ``processor`` the processor time of the run's own process
+            in it; ``detector`` is a network beside it.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
         wall_s: Wall-clock time of the whole run.
         peak_memory_mb: Largest resident memory.
         peak_gpu_memory_mb: Largest GPU memory, None without one.
         machine: The computer.
-        versions: Of Python and the packages that matter.
+        versions: Versions of Python and the packages that matter.
         git: Revision of the checkout.
         command: The command line of the parent process.
         identity: What `run_id` stands for.
@@ -394,7 +395,7 @@ class MetricRecord(Record):
     """The errors of one run under one protocol.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         run_id: The run.
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.

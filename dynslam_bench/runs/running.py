@@ -123,7 +123,7 @@ def run_one(
 def _job(
     run: ResolvedRun, work_folder: Path, protocol: Protocol, progress_every: int
 ) -> dict[str, Any]:
-    """What the child is told: the run, and how to report partial metrics."""
+    """The message to the child: the run, and how to report partial metrics."""
     job = make_job(
         CHILD_ENTRY_POINT,
         work_folder,

@@ -103,7 +103,7 @@ class RunStore:
         """
         return self.runs / checked_id(run_id, "a run's id")
 
-    def place(self, run_id: str) -> Path:
+    def shown_folder(self, run_id: str) -> Path:
         """Folder of one run as messages name it: below the archive that the store was unpacked from."""
         return self.source / "runs" / run_id
 
@@ -257,7 +257,7 @@ class RunStore:
             if (other.folder(record.run_id) / RUN_FILE).is_file():
                 raise
             raise RunError(
-                f"{other.place(record.run_id)} was removed while it was copied"
+                f"{other.shown_folder(record.run_id)} was removed while it was copied"
             ) from error
 
     def check_copy(self, work: Path, record: RunRecord) -> None:
@@ -386,7 +386,7 @@ class RunStore:
             try:
                 started.append((self.read_whole(run_id).started, run_id))
             except DynslamError as error:
-                unreadable.append(Unreadable(self.place(run_id), str(error)))
+                unreadable.append(Unreadable(self.shown_folder(run_id), str(error)))
         return Records(self, [run_id for _, run_id in sorted(started)]), unreadable
 
     def find(self, prefix: str) -> str:
@@ -532,7 +532,7 @@ class RunStore:
     def _inputs(
         self, record: RunRecord, protocol: Protocol, which: TrajectoryKind
     ) -> tuple[Trajectory, Trajectory, NDArray[np.float64] | None]:
-        """What one of a run's trajectories is evaluated with.
+        """Inputs of the evaluation of one of a run's trajectories.
 
         Returns:
             The trajectory, the ground truth, and the stamps of all input frames in seconds; None in
@@ -582,7 +582,7 @@ class RunStore:
                     is_scored = record.status != "stopped"
                     yield record, self.score(record, protocol) if is_scored else None
                 except DynslamError as error:
-                    reasons.append(f"{self.place(run_id)}: {error}")
+                    reasons.append(f"{self.shown_folder(run_id)}: {error}")
 
         frame = runs_frame(scored())
         warn_of_unreadable(reasons)
@@ -695,7 +695,7 @@ def score(
 
 @dataclass(frozen=True)
 class Merged:
-    """What `copying.merge` did.
+    """Runs that `copying.merge` copied, that were stored already, and that it left out.
 
     Attributes:
         added: Ids of the runs that were copied.

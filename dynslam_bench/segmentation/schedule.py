@@ -240,7 +240,7 @@ class _Track:
         box: float32 ``[4]``, x0, y0, x1, y1, pixels.
         mask: bool ``[H, W]``.
         name: Its class.
-        score: Of its last detection.
+        score: Score of its last detection, 0 to 1.
         velocity: float32 ``[4]``, change of the box, pixels a frame.
         hits: How often it was detected.
         missed: Segmented frames in a row without a detection of it.

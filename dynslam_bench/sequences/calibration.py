@@ -399,7 +399,7 @@ def _over_windows(
     spare = information.sum() - (information**2).sum() / information.sum()
     between = max(0.0, (q - (k - 1)) / max(spare, 1e-12))
 
-    # random effects
+    # mean of the windows, weighted by the variance within and between them (random effects)
     weights = 1 / (1 / np.maximum(information, 1e-12) + between)
     mean = float((values * weights).sum() / weights.sum())
     scatter = float((weights * (values - mean) ** 2).sum() / ((k - 1) * weights.sum()))

@@ -114,7 +114,7 @@ class SequencePart:
         id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed
             stays in it.
         content: Digest of the whole content, however much of it is seen.
-        scene: The same without the draw of the sensors' noise.
+        scene: Digest of the content without the draw of the sensors' noise.
         camera: The camera before any preprocessing, without what its ground truth tracks.
         start: First frame of the named part in the numbering of the whole sequence, before any
             offset.

@@ -60,7 +60,7 @@ ROOT_MAP = 0
 
 
 class CameraStatus(Enum):
-    """What is known of the camera's place; the back end's states.
+    """States of the back end: how well the camera's place is known.
 
     `INITIALISING` becomes `TRACKED` with the first keyframe or, in a loaded map, when the camera is
     found. `TRACKED` becomes `LOST` with a frame that the map does not explain. `LOST` becomes
@@ -632,7 +632,7 @@ class Backend:
         slam_map = self.map
         root_map_pose = RootMapPose.REJECTED
 
-        # local mapping
+        # local mapping: insert the keyframe, triangulate, cull, adjust its neighbourhood
         slot, timings = self.mapper.insert(
             tracked.observations,
             tracked.point,
@@ -644,7 +644,7 @@ class Backend:
         self._reference_keyframe = slot
         self._transfer_history()
 
-        # loop closing
+        # loop closing: recognise an earlier place, and correct the map
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             T_before = slam_map.kf_pose[slot].copy()
@@ -692,7 +692,7 @@ class Backend:
         return se3.inverse(T_cam_world), covariance
 
     def view(self) -> MapView:
-        """What filters may read of the map that the camera is in; `finalize` does not change it."""
+        """View for filters of the map that the camera is in; `finalize` does not change it."""
         return self._map_views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:

@@ -121,7 +121,7 @@ class Correction:
 
     @property
     def T_now_before(self) -> Array:
-        """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
+        """Transform ``[4, 4]`` from the keyframe's world, once its lengths are multiplied, to the place's world."""
         before = self.T_cam_before.copy()
         before[:3, 3] *= self.scale
         return se3.inverse(self.T_cam_now) @ before
@@ -163,7 +163,7 @@ class Loop:
 
 
 class RootMapPose(Enum):
-    """What follows from a pose in the root map that was found for a camera in a submap."""
+    """Verdict on a pose in the root map that was found for a camera in a submap."""
 
     REJECTED = "rejected"
     """There is none, or it is ambiguous or cannot be reached: the frame is tracked in the submap alone."""
@@ -193,7 +193,7 @@ class LoopCloser:
     Args:
         atlas: The maps.
         mapper: Fuses and adjusts.
-        settings: Of the back end.
+        settings: Settings of the back end.
         seed: Founds RANSAC's draws.
         scale_is_known: Whether lengths are metres everywhere, as with depth.
 
@@ -695,10 +695,10 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
     Drift-Aware Large Scale Monocular SLAM, RSS 2010) solve for scales and poses together.
 
     Args:
-        ids: Of the keyframes, ``[N]``, ascending.
+        ids: Ids of the keyframes, int64 ``[N]``, ascending.
         edges: Edges along which scale was kept. The oldest keyframe of each connected component
             stays.
-        loop_edge: From the keyframe that was recognised to the one that recognises it.
+        loop_edge: Edge from the keyframe that was recognised to the one that recognises it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
     Returns:
@@ -734,7 +734,7 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     """The poses that fit the edges best; the first one stays.
 
     Args:
-        ids: Of the poses, ``[N]``, ascending.
+        ids: Ids of the keyframes whose poses are optimised, int64 ``[N]``, ascending.
         poses: World to camera ``[N, 4, 4]``, where the search starts.
         edges: Edges between them; the graph must be connected.
 

@@ -268,7 +268,7 @@ class CameraMotion:
 
         Args:
             T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
-            T_cam_now: That pose now.
+            T_cam_now: World-to-camera pose of the same keyframe now.
             scale: What lengths around it were multiplied by.
         """
         if self.state is not None:

@@ -38,6 +38,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.features.enlarging import enlarged, enlarged_mask, in_given_image
 from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -257,19 +258,23 @@ class SlamPipeline:
         """Keypoints, and their undistorted pixels ``[N, 2]``."""
         extractor = self._extractor
         with clock("features"):
+            # a narrow image is enlarged
+            image = enlarged(gray)
             if (
                 mask is not None
                 and self._segmentation is not None
                 and isinstance(extractor, MaskedExtractor)
             ):
-                keypoints = extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+                share = self._segmentation.outside_share
+                keypoints = extractor.extract_masked(image, enlarged_mask(mask), share)
             else:
-                keypoints = extractor.extract(gray)
+                keypoints = extractor.extract(image)
+            keypoints = in_given_image(keypoints, gray)
             xy = self._camera.undistort_points(keypoints.xy)
         return keypoints, xy
 
     def _filter_state(self, frame: FrameBundle) -> FilterState:
-        """What filters may read beside the frame: the previous frame, the prediction and the map."""
+        """State that filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
         T_world_pred, covariance = self._backend.predict_T_world_cam(frame.timestamp)
         keyframes, map_points = self._backend.view()
@@ -583,7 +588,7 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     current_points = camera.unproject(frame.xy[has_depth], frame.z[has_depth])
     points = current_points @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
 
-    # their projections
+    # where they appear in the previous image, unless they would lie behind its camera
     ahead = points[:, 2] > MIN_PREDICTED_DEPTH_M
     rows = np.flatnonzero(has_depth)[ahead]
     guess[rows] = camera.distort_points(camera.project(points[ahead]))

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import Words, match_brute_force
-from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry import Camera, feature_scale, pixel_index, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
@@ -115,9 +115,9 @@ not connected with it: the camera was kidnapped."""
 CONNECTED = 20
 """Matches that must fit one homography to connect two images."""
 CONNECTED_SHARE = 0.4
-"""Their share of all matches, at least."""
+"""Least share of these matches among all."""
 HOMOGRAPHY_PX = 4.0
-"""Largest error of these matches, pixels."""
+"""Largest error of these matches, pixels of octave 0."""
 ROTATION_SLACK = np.radians(20.0)
 """Largest error of the rotation is this angle, radians, plus `ROTATION_SLACK_SHARE`."""
 ROTATION_SLACK_SHARE = 0.75
@@ -569,7 +569,8 @@ class RotationEstimate:
 
     Attributes:
         observations: Features of the newest image.
-        R_now_last: From the camera's axes in the last tracked frame to those of now, ``[3, 3]``.
+        R_now_last: Rotation ``[3, 3]`` from the camera's axes in the last tracked frame to those
+            now.
         apparent: Sum of the rotations between consecutive images, radians.
     """
 
@@ -595,7 +596,8 @@ class RotationEstimate:
             return None
         xy_before = self.observations.xy[row_before]
         xy_now = observations.xy[row_now]
-        homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
+        tolerance_px = HOMOGRAPHY_PX * feature_scale(camera.width)
+        homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, tolerance_px)
         fits = np.zeros(len(row_before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(row_before)):
             return None
@@ -626,7 +628,7 @@ class RotationEstimate:
 
         Args:
             T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
-            T_now_world: That of now.
+            T_now_world: World-to-camera pose ``[4, 4]`` now.
             more: How far the two worlds may be rotated against each other, radians.
         """
         difference = T_now_world @ se3.inverse(self.applied(T_last_world))

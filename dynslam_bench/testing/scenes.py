@@ -143,8 +143,8 @@ def draw(
     )
     ray_x, ray_y, ray_z = np.moveaxis(rays @ pose[:3, :3].T, -1, 0)
 
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x in metres: depth along each ray; the nearer one is
-    # seen
+    # depth along each ray of the walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x in metres; the nearer
+    # wall is seen
     walls = [
         (2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)
     ]

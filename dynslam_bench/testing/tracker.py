@@ -138,7 +138,7 @@ class _Runner:
     Args:
         report: Gets a sign of life with each frame.
         subject: A spec, or a function that constructs trackers.
-        settings: Of the trackers that are constructed.
+        settings: Settings of the trackers that are constructed.
         scene: What to track.
         frames: How many of its frames.
         seed: Seed of the randomness.

@@ -36,7 +36,7 @@ class Block:
         figure: The figure.
         caption: Below the figure, or above the code.
         text: The code, which a button copies.
-        entries: Of the list.
+        entries: Entries of the list.
         folded: Whether it is closed at first, behind its title.
     """
 

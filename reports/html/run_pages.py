@@ -59,7 +59,7 @@ _NO_STAGES = ("total_s", "processor_s", "read_s")
 
 @dataclass(frozen=True)
 class RunPage:
-    """What the report needs of a run whose page was written.
+    """Entry in the report for a run whose page was written.
 
     Attributes:
         variant_key: Its tracker and settings.
@@ -102,7 +102,7 @@ def write_run_pages(
         pictured: Ids of the runs whose pictures are copied.
         protocol: How errors are computed.
         output: Folder of the report.
-        least: The least error on each sequence that has one, by `RunRow.column_id`.
+        least: The least error on each sequence that has one, by `RunRow.sequence_key`.
         pool: Workers that write the pages; None to write them here.
         progress: Called with the runs that are done, and all.
 
@@ -113,12 +113,12 @@ def write_run_pages(
     newest = sorted(rows, key=lambda row: row.started, reverse=True)
     newest.sort(key=lambda row: row.offset)
     shares = {}
-    for column, runs in grouped(newest, lambda row: row.column_id).items():
+    for column, runs in grouped(newest, lambda row: row.sequence_key).items():
         shares[column] = exact_shares(runs)
 
     # write the pages, those of one column after each other
     jobs = []
-    for column, runs in grouped(rows, lambda row: row.column_id).items():
+    for column, runs in grouped(rows, lambda row: row.sequence_key).items():
         for row in runs:
             best = (least or {}).get(column)
             jobs.append((row, row.run_id in pictured, shares[column], protocol, output, best))
@@ -254,7 +254,7 @@ def run_data(
     for name, values in (series | track).items():
         packed_series[name] = packed(values, "i4" if name == "index" else "f4")
 
-    level, verdict = verdict_of(row, frames, least)
+    level, verdict = run_summary(row, frames, least)
     return {
         "id": row.run_id,
         "level": level,
@@ -270,7 +270,7 @@ def run_data(
         "notes": [*row.notes, *filter(None, [frames.fault, fault, _rotation_doubt(row)])],
         "command": run_command(row),
         "asked": command_line(row.command),
-        "log": _log(row),
+        "log": _log_tail(row),
         "pictures": list(pictures),
         "worst": _worst(frames),
         "moment": _moment(row, frames),
@@ -301,7 +301,7 @@ def _stages_data(record: RunRecord) -> list[list[Any]]:
 Level = Literal["red", "amber", "green"]
 
 
-def verdict_of(
+def run_summary(
     row: RunRow, frames: RunFrames, least: LeastError | None = None
 ) -> tuple[Level, str]:
     """How a run ended, and why, in one sentence, with its level.
@@ -436,7 +436,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
 
 
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
-    """What else is known of a run: name and text."""
+    """Rows (name, text) of the table of further numbers on a run's page; missing ones are left out."""
     # name, value, factor to the unit that is shown, unit
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
@@ -453,7 +453,7 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
     ]
 
 
-def _log(row: RunRow) -> str:
+def _log_tail(row: RunRow) -> str:
     """The end of a run's log; empty for none."""
     path = row.folder / "log.txt"
     if not path.is_file():
@@ -583,10 +583,10 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         whole = truth or estimate
         start = 0.0 if whole is None else float(whole.timestamps[0])
 
-    # the true path
+    # curves of the true path, in seconds since the start
     series: Series = {}
     if truth is not None and len(truth) > 1:
-        drawn = _of_part(row, truth)
+        drawn = _truth_of_run(row, truth)
         series = _along("true", drawn.timestamps - start, [drawn.positions, _angles(drawn, truth)])
 
     # the estimate: aligned and with its errors, where there is ground truth
@@ -614,7 +614,7 @@ def _residuals(positions: Array, true_positions: Array) -> Series:
     return {f"residual_{axis}": points[:, column] for column, axis in enumerate("xyz")}
 
 
-def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
+def _truth_of_run(row: RunRow, truth: Trajectory) -> Trajectory:
     """The ground truth between the first and the last frame of the run's part; all of it where that is not known."""
     with suppress(DynslamError):
         stamps = row.store.timestamps(row.sequence.part)
@@ -636,15 +636,15 @@ def _along(name: str, stamps: Array, columns: Sequence[Array]) -> Series:
     return series
 
 
-def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dict[str, Any]:
-    """A line of a figure.
+def _line(name: str, x: str, y: str, colour: str, panel: int, **more: Any) -> dict[str, Any]:
+    """A plotly trace whose data are named series: ``"@x"``, filled in by the page, see `_series`.
 
     Args:
         name: What the legend calls it.
         x: Name of the series along the axis.
         y: Name of the series that is drawn.
         colour: Its colour.
-        axis: Number of the panel, from 1 on.
+        panel: Number of the panel, from 1 on.
         **more: Further properties of plotly's trace; ``line`` adds to colour and width.
     """
     style = {"color": colour, "width": 1.8} | more.pop("line", {})
@@ -656,7 +656,7 @@ def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dic
         "y": f"@{y}",
         "line": style,
         "xaxis": "x",
-        "yaxis": f"y{axis if axis > 1 else ''}",
+        "yaxis": f"y{panel if panel > 1 else ''}",
     }
     return trace | more
 

@@ -15,6 +15,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import blended_transform_factory
+from plotly.colors import unlabel_rgb
 
 from dynslam_bench.reports.figures import NEUTRAL
 
@@ -124,12 +125,27 @@ def _draw(figure: go.Figure, axes: Axes) -> None:
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
 
 
+def _one_colour(colour: object) -> str | tuple[float, float, float]:
+    """A trace's colour as matplotlib takes it; `NEUTRAL` for none, and for one a point.
+
+    Args:
+        colour: A name, ``#rrggbb``, ``rgb(r, g, b)`` with levels of 0 to 255, or numbers on a colour scale.
+    """
+    if not isinstance(colour, str):
+        return NEUTRAL
+    if not colour.startswith("rgb("):
+        return colour
+    red, green, blue = unlabel_rgb(colour)
+    return (red / 255, green / 255, blue / 255)
+
+
 def _draw_scatter(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray) -> None:
     """Draw a trace's line, its points and their error bars."""
     mode = trace.mode or "lines"
     label = _legend_label(trace)
     marker = trace.marker
-    line_colour = trace.line.color or marker.color or NEUTRAL
+    marker_colour = _one_colour(marker.color)
+    line_colour = _one_colour(trace.line.color or marker.color)
     if "lines" in mode:
         dash = _DASHES.get(trace.line.dash or "solid", "-")
         width = _POINTS_PER_PIXEL * (trace.line.width or 2)
@@ -138,14 +154,14 @@ def _draw_scatter(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray) -> None:
         label = None
     if trace.error_y.array is not None:
         ends = [np.asarray(trace.error_y.arrayminus, float), np.asarray(trace.error_y.array, float)]
-        axes.errorbar(x, y, yerr=ends, fmt="none", ecolor=marker.color or NEUTRAL)
+        axes.errorbar(x, y, yerr=ends, fmt="none", ecolor=marker_colour)
     if "markers" not in mode:
         return
 
     # points of one symbol at a time
     given = marker.symbol or "circle"
     symbols = [given] * len(x) if isinstance(given, str) else list(given)
-    colour = marker.color if isinstance(marker.color, str) else line_colour
+    colour = marker_colour if isinstance(marker.color, str) else line_colour
     size = _POINTS_PER_PIXEL * (marker.size if isinstance(marker.size, int | float) else 6)
     is_seen = trace.opacity != 0
     for symbol in dict.fromkeys(symbols):
@@ -170,7 +186,7 @@ def _draw_bars(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray, width: floa
         x,
         y,
         width,
-        color=trace.marker.color,
+        color=_one_colour(trace.marker.color),
         alpha=trace.marker.opacity,
         label=_legend_label(trace),
     )

@@ -60,8 +60,7 @@ class Scene:
 
     Attributes:
         camera: The camera.
-        frames: Of each frame its static keypoints, their depth, and the mask of people as packed
-            bits.
+        frames: Static keypoints of each frame, their depth, and the mask of people as packed bits.
         poses: True camera-to-world poses ``[N, 4, 4]``.
         fps: Frames a second.
     """

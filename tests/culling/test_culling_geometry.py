@@ -158,6 +158,7 @@ def test_free_space_culls_what_stands_where_enough_recent_keyframes_measured_cle
     keep = (
         FreeSpaceFilter(FreeSpaceSettings(min_share=0.0, **settings)).apply(made.frame, state).keep
     )
+    # the near points of the scene
     assert keep[made.frame.z < 3.9].any() != violated
     assert keep.all() != violated
 

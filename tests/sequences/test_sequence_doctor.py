@@ -389,7 +389,7 @@ class Room:
 
 
 class Watched(Wrapped):
-    """The same; `most` counts the largest number of its images that existed at once."""
+    """A wrapped sequence whose `most` is the largest number of its images that existed at once."""
 
     def __init__(self, base):
         self.base = base

@@ -394,7 +394,7 @@ def test_of_equal_scores_the_newer_keyframe_is_first(room, slam_map):
 
 
 def reference_scores(slam_map, keyframes, features):
-    """The same score, counted substring by substring without an index."""
+    """Scores of keyframes, counted substring by substring without an index."""
     query = np.ascontiguousarray(features.descriptors).view(np.uint16)[:, ::STRIDE]
     shared = []
     for slot in keyframes.tolist():

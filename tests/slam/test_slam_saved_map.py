@@ -150,7 +150,7 @@ def test_other_descriptors_and_missing_maps_are_refused(made, tmp_path):
 
 @pytest.fixture
 def arrays(made):
-    """Those of the map's file."""
+    """Arrays of the map's file."""
     with np.load(made[2]) as stored:
         return dict(stored)
 

@@ -125,7 +125,8 @@ class FileNote:
 
     Attributes:
         stamp: What it was then; None where it was not there.
-        digest: Of its content then; empty where it is still to be taken.
+        digest: Digest of the file's content when it was opened; empty where it is still to be
+            taken.
     """
 
     stamp: Stamp | None
@@ -134,7 +135,7 @@ class FileNote:
 
 @dataclass
 class Notes:
-    """What a recorder has noted so far.
+    """Files, folders, variables and commands that a recorder has noted so far.
 
     Attributes:
         files: Each file that was opened to be read.
@@ -186,7 +187,7 @@ class Collector:
 
     Args:
         base_folders: The folders in which names of files begin.
-        origins: Whose files are.
+        origins: Tells whose a file is.
         private: Beginnings of the paths of what the run owns.
     """
 
@@ -209,10 +210,10 @@ class Collector:
         self._variables: dict[Command, set[str]] = {}
 
     def collect(self, modules: Modules) -> Reads:
-        """What was read so far.
+        """The record of what was read so far.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         imports = modules.imports
         programs, distributions = self._programs(imports)
@@ -330,7 +331,7 @@ class Collector:
         """The first thing that has changed since it was read, in words; empty where nothing has.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         for path, note in self.notes.files.items():
             self.compare(path, note, stamp_of(path))

@@ -7,9 +7,9 @@ variables that they look up.
 Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``,
 ``onnxruntime``. In their place each file counts whose name is written in a plug-in's sources, or in
 a small text file that foreign code opened. So does each image and network in a folder that it
-listed. A file that sources name, or that a plug-in looks for, and that is not there counts as absent.
-Files that are named by a descriptor
-of their folder are not seen, nor is what comes from the network.
+listed. A file that sources name, or that a plug-in looks for, and that is not there counts as
+absent. Files that are named by a descriptor of their folder are not seen, nor is what comes from
+the network.
 
 Of programs counts what `core.programs` shows, what their command lines name, and the environment
 variables whose names are written in the command or in its files.
@@ -191,7 +191,7 @@ class ReadRecorder:
         return self._collector.collect(modules)
 
     def so_far(self) -> Reads:
-        """What was read so far; it may change until the end."""
+        """The record of what was read so far; it may change until the end."""
         with self._ignoring_own_reads():
             return self._collector.collect(self._collector.modules())
 

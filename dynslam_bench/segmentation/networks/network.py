@@ -88,8 +88,8 @@ class RPN(nn.Module):
 
         Args:
             levels: P2..P6.
-            height: Of the padded input.
-            width: Of the padded input.
+            height: Height of the padded input, pixels.
+            width: Width of the padded input, pixels.
             sizes: Height and width of each image inside the padded input.
 
         Returns:
@@ -148,9 +148,9 @@ def rpn_loss(
     """Losses of objectness and of box codes (Ren et al. 2015, Eq. 1), 256 anchors an image, half of them positive.
 
     Args:
-        anchors: Of each level.
-        logits: Of each level ``[B, N_l]``.
-        codes: Of each level ``[B, N_l, 4]``.
+        anchors: Anchors ``[N_l, 4]`` of each level, input pixels.
+        logits: Objectness logits ``[B, N_l]`` of each level.
+        codes: Box codes ``[B, N_l, 4]`` of each level.
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
@@ -202,7 +202,7 @@ def roi_align(
     Args:
         features: Levels ``[B, C, H_l, W_l]``, finest first.
         boxes: One ``[K_b, 4]`` an image, input pixels.
-        image_height: Of the network's input; gives the levels' scales.
+        image_height: Height of the network's input, pixels; gives the levels' scales.
         size: Bins a side.
         canonical: Box side that goes to the third level.
 
@@ -385,13 +385,13 @@ class RoIHeads(nn.Module):
         """Objects of one image (inference).
 
         Args:
-            levels: P2..P5 ``[1, C, H, W]``.
-            mask_levels: m2..m5.
-            proposals: ``[K, 4]``.
-            image_height: Of the padded input.
+            levels: P2..P5 ``[1, C, H_l, W_l]``.
+            mask_levels: m2..m5, the mask branch's levels ``[1, C, H_l, W_l]``.
+            proposals: Boxes ``[K, 4]``, input pixels x0 y0 x1 y1.
+            image_height: Height of the padded input, pixels.
             size: Height and width of the image inside it.
             score: Least score.
-            iou: Of the suppression within a class.
+            iou: IoU above which the weaker of two boxes of one class is suppressed.
         """
         # classes and boxes of the proposals
         pooled = roi_align(
@@ -402,7 +402,7 @@ class RoIHeads(nn.Module):
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
 
-        # what is confident and not empty, suppressed within each class
+        # boxes that are confident and not empty, suppressed within each class
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         box = boxes[keep]
         best = scores[keep]
@@ -411,6 +411,8 @@ class RoIHeads(nn.Module):
         box = box[chosen]
         best = best[chosen]
         label = label[chosen]
+
+        # of each box the mask of its class
         mask_logits = self.masks(mask_levels, [box], image_height)
         masks = mask_logits[torch.arange(len(label), device=label.device), label].sigmoid()
         return Detections(box, label, best, masks)

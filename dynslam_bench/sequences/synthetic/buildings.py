@@ -36,7 +36,7 @@ HALL_SPEED = 0.45
 
 
 class _Shape(NamedTuple):
-    """What differs between the buildings.
+    """Values in which the buildings differ.
 
     Attributes:
         aside_deg: How far the camera looks aside from where it walks, degrees.
@@ -75,7 +75,7 @@ class _LoosePiece(NamedTuple):
 
 @dataclass
 class _Building:
-    """What is built so far; every stretch of wall and every loose piece has its number.
+    """The parts that are built so far; every stretch of wall and every loose piece has its number.
 
     Attributes:
         scene: The scene.

@@ -71,7 +71,7 @@ class DepthModel(NamedTuple):
 
     Attributes:
         fx: Focal length, pixels.
-        baseline_m: From the camera to the projector.
+        baseline_m: Distance from the camera to the projector, metres.
         disparity_noise_px: Standard deviation of the disparity.
         near_m: Nothing nearer is measured.
         far_m: Nothing further is measured.
@@ -853,7 +853,7 @@ def measure_depth(
     Args:
         row0: First row.
         row1: One past the last row.
-        seed: Of this frame's noise.
+        seed: Seed of this frame's noise.
         sensor: The depth camera.
         depth: Exact z-depth ``[H, W]``, metres.
         cosine: Cosine of incidence ``[H, W]``.

@@ -439,7 +439,7 @@ def partition(
 
     Args:
         start: One end, metres.
-        end: The other.
+        end: Other end, metres.
         plan: Its colour.
         doors: Middles of the doorways, metres from `start`, in order.
     """

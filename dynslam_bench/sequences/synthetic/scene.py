@@ -50,8 +50,8 @@ class Optics:
     """Settings of a sequence's sensors that differ from the defaults.
 
     Attributes:
-        readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The
-            frame's stamp and pose belong to the middle of the image.
+        readout_s: Seconds from the first row's exposure to the last one's; 0 is a global shutter.
+            The frame's stamp and pose belong to the middle of the image.
         auto_exposure: 0 keeps the exposure, 1 brings every image to the same mean brightness.
         gain: Brightness of the lamps, or what gives it for a time in seconds.
         color: Settings of `ColorSensor` that differ, where the user left them.

@@ -32,7 +32,11 @@ _LEVELS = 12
 
 
 def build_atlas(textures: list[Image]) -> TextureAtlas:
-    """Pack textures; each is halved by 2x2 means down to one texel."""
+    """Pack textures with their mipmaps: each is halved by 2x2 means down to one texel.
+
+    Args:
+        textures: Colours ``[S, S, 3]`` from 0 to 255, red first; S is a power of two.
+    """
     level_offset = np.zeros((len(textures), _LEVELS), np.int64)
     log2_size = np.zeros(len(textures), np.int32)
     parts: list[NDArray[np.uint8]] = []
@@ -43,6 +47,7 @@ def build_atlas(textures: list[Image]) -> TextureAtlas:
         for level in range(_LEVELS):
             # levels that the texture does not have are its last one
             level_offset[index, level:] = position
+            # four bytes a texel, so that its address is a shift; the last byte stays empty
             texels = np.zeros((*current.shape[:2], 4), np.uint8)
             texels[..., :3] = np.floor(current + 0.5)
             parts.append(texels.ravel())

@@ -148,7 +148,7 @@ def compose(
     filters: Sequence[DynamicFilter] = (),
     flow: "FlowMethodSettings | None" = None,
 ) -> Tracker:
-    """The pipeline of a system.
+    """Build the pipeline of a system: back end, extractor, segmentation, filters and flow.
 
     Args:
         settings: Its settings; a `SemanticSystemSettings` brings a segmentation stage.
