@@ -13,14 +13,18 @@ import plotly.graph_objects as go
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import blended_transform_factory
 from plotly.colors import unlabel_rgb
 
 from dynslam_bench.reports.figures import NEUTRAL
 
-WIDTH_INCHES = 9.0
-"""Width of a picture: that of a page of paper between its margins, with room for a legend."""
+WIDTH_INCHES = 9.6
+"""Width of a picture: that of a page of paper between its margins."""
+LETTER_INCHES = 0.07
+"""About the width of a letter of a label: room is left for labels, since to measure them takes a second drawing."""
+LINE_INCHES = 0.17
+"""Height of a line of the legend."""
 PIXELS_PER_INCH = 96
 """What a pixel of a figure's height is on paper, as CSS has it."""
 _MARKERS = {
@@ -67,12 +71,46 @@ def still(figure: go.Figure) -> str:
         return ""
     height = (figure.layout.height or 420) / PIXELS_PER_INCH
     with matplotlib.rc_context(_STYLE):
-        picture = Figure(figsize=(WIDTH_INCHES, height))
-        _draw(figure, picture.add_subplot())
+        picture = Figure()
+        axes = picture.add_subplot()
+        _draw(figure, axes)
+        _leave_room(picture, axes, height)
         text = io.StringIO()
-        picture.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None})
+        picture.savefig(text, format="svg", metadata={"Date": None})
     encoded = base64.b64encode(text.getvalue().encode()).decode()
     return f"data:image/svg+xml;base64,{encoded}"
+
+
+def _leave_room(picture: Figure, axes: Axes, height: float) -> None:
+    """Set the size of a picture, in inches, and the margins that its labels and its legend need."""
+    legend = axes.get_legend()
+    entries = [] if legend is None else [text.get_text() for text in legend.get_texts()]
+    lines = sum(1 + entry.count("\n") for entry in entries)
+    height = max(height, LINE_INCHES * (lines + 4))
+    left = 0.55 + LETTER_INCHES * _longest(label.get_text() for label in axes.get_yticklabels())
+    right = 0.6 + LETTER_INCHES * _longest(entries) if entries else 0.2
+
+    # names along the axis below are turned where they would overlap
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    bottom = 0.55
+    if LETTER_INCHES * sum(len(name) + 2 for name in names) > WIDTH_INCHES - left - right:
+        axes.tick_params("x", labelrotation=30)
+        for label in axes.get_xticklabels():
+            label.set_horizontalalignment("right")
+        bottom += 0.5 * LETTER_INCHES * _longest(names)
+
+    picture.set_size_inches(WIDTH_INCHES, height + bottom)
+    picture.subplots_adjust(
+        left=left / WIDTH_INCHES,
+        right=1 - right / WIDTH_INCHES,
+        bottom=bottom / (height + bottom),
+        top=1 - 0.15 / (height + bottom),
+    )
+
+
+def _longest(labels: Iterable[str]) -> int:
+    """Letters of the longest line of some labels."""
+    return max((len(line) for label in labels for line in label.split("\n")), default=0)
 
 
 def _is_drawn(trace: Any) -> bool:
@@ -243,7 +281,7 @@ def _set_labels(side: Axis, axis: Any, names: Sequence[str]) -> None:
     elif axis.type == "log":
         side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        side.set_minor_formatter(NullFormatter())
+        side.set_minor_locator(NullLocator())
     elif axis.tickvals is not None and axis.ticktext is not None:
         side.set_ticks(axis.tickvals, [_plain(text) for text in axis.ticktext])
 
