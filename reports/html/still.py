@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -76,7 +77,10 @@ def still(figure: go.Figure) -> str:
         _draw(figure, axes)
         _leave_room(picture, axes, height)
         text = io.StringIO()
-        picture.savefig(text, format="svg", metadata={"Date": None})
+        with warnings.catch_warnings():
+            # letters stay letters: the reader's browser has the font, whatever is installed here
+            warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+            picture.savefig(text, format="svg", metadata={"Date": None})
     encoded = base64.b64encode(text.getvalue().encode()).decode()
     return f"data:image/svg+xml;base64,{encoded}"
 
