@@ -14,7 +14,7 @@ import plotly.graph_objects as go
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import blended_transform_factory
 from plotly.colors import unlabel_rgb
 
@@ -44,6 +44,8 @@ _MARKERS = {
 """Symbols of plotly's points to matplotlib's."""
 _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 _POINTS_PER_PIXEL = 0.75
+_NARROW = 6.0
+"""A logarithmic axis that ends below so many times its beginning has evenly spaced labels: 1, 2 and 5 are too few."""
 _STYLE = {
     # letters stay letters, and names with a dollar sign are no formulas
     "svg.fonttype": "none",
@@ -132,8 +134,6 @@ def _draw(figure: go.Figure, axes: Axes) -> None:
     y_names = _names(layout.yaxis, [trace.y for trace in figure.data])
     axes.set_xscale("log" if layout.xaxis.type == "log" else "linear")
     axes.set_yscale("log" if layout.yaxis.type == "log" else "linear")
-    _set_labels(axes.xaxis, layout.xaxis, x_names)
-    _set_labels(axes.yaxis, layout.yaxis, y_names)
 
     # the traces; bars of one place stand side by side
     bars = [trace for trace in figure.data if trace.type == "bar"]
@@ -158,6 +158,8 @@ def _draw(figure: go.Figure, axes: Axes) -> None:
         _write_note(axes, note)
 
     # axes
+    _set_labels(axes.xaxis, layout.xaxis, x_names)
+    _set_labels(axes.yaxis, layout.yaxis, y_names)
     axes.set_xlabel(_plain(layout.xaxis.title.text or ""))
     axes.set_ylabel(_plain(layout.yaxis.title.text or ""))
     if layout.yaxis.range is not None and layout.yaxis.type != "log":
@@ -283,7 +285,9 @@ def _set_labels(side: Axis, axis: Any, names: Sequence[str]) -> None:
     if names:
         side.set_ticks(range(len(names)), [_plain(name) for name in names])
     elif axis.type == "log":
-        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        low, high = side.get_view_interval()
+        is_narrow = high < _NARROW * low
+        side.set_major_locator(MaxNLocator(6) if is_narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
         side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         side.set_minor_locator(NullLocator())
     elif axis.tickvals is not None and axis.ticktext is not None:
