@@ -186,7 +186,7 @@ def remove_unused(folder: Path, now: float) -> None:
     """Remove the kernels that nobody has loaded for `UNUSED_S`, and what killed processes left half-written.
 
     Args:
-        folder: Where they lie; it may be missing.
+        folder: Folder of the compiled kernels; it may be missing.
         now: The time, in seconds since the epoch.
     """
     sweep_temporary(folder)
