@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -186,6 +187,7 @@ def run(
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
+    announce_recordings(sequences, camera)
     # one specification for each sequence, seed and offset
     specs = make_specs(
         tracker,
@@ -218,6 +220,18 @@ def run(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
     make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
+
+
+def announce_recordings(sequences: list[str], camera: str | None) -> None:
+    """Say what the folders among the sequences are taken for; one that cannot be opened is reported with its run."""
+    from dynslam_bench.sequences import open_sequence
+
+    for name in sequences:
+        if not Path(name).expanduser().is_dir():
+            continue
+        with suppress(DynslamError):
+            for line in getattr(open_sequence(name, camera=camera), "taken_for", ()):
+                announce(line)
 
 
 def default_protocol(tracker: str) -> str:
