@@ -29,7 +29,14 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
-from dynslam_bench.core import DynslamError, RunError, label_text, weights_folder
+from dynslam_bench.core import (
+    DynslamError,
+    RunError,
+    call_periodically,
+    label_text,
+    weights_folder,
+)
+from dynslam_bench.core.folders import kernel_files
 
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
@@ -446,6 +453,10 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
     return typer.confirm("Download it?", default=True, err=True)
 
 
+COMPILED_S = 1.0
+"""How often is looked for compiled kernels."""
+
+
 class WatchedRuns:
     """The events of runs as a progress bar, and what is known of the runs afterwards.
 
@@ -470,12 +481,25 @@ class WatchedRuns:
         # finished runs, and of running ones the share of their frames that is done
         self._done = 0.0
         self._shares: dict[str, float] = {}
+        # of the newest event, for what is said between events
+        self._total: float | None = None
+        self._text = ""
+        self._kernels_before = set(kernel_files())
 
     def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
-        with progress("runs") as self._advance:
+        with (
+            progress("runs") as self._advance,
+            call_periodically(COMPILED_S, self._say_what_is_compiled),
+        ):
             self._advance(0, None, "opening sequences")
             return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
+
+    def _say_what_is_compiled(self) -> None:
+        """While no frame is done, how many kernels a system's first run on this machine has compiled."""
+        compiled = len(set(kernel_files()) - self._kernels_before)
+        if compiled and not self._done:
+            self._advance(0, self._total, f"{self._text}, {compiled} kernels compiled, once")
 
     def _plan(self, plan: runs.Plan) -> None:
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
@@ -491,7 +515,9 @@ class WatchedRuns:
             share = event.partial["frames_done"] / max(event.partial["frames"], 1)
             self._shares[event.run_id] = share
             self._done += share - before
-        self._advance(self._done, event.total, event_text(event))
+        self._total = event.total
+        self._text = event_text(event)
+        self._advance(self._done, self._total, self._text)
 
     def _ended(self, event: runs.RunEvent, record: runs.RunRecord) -> None:
         """Remember what a run was asked to open and whether it was stored, and write a line on it."""
