@@ -31,7 +31,7 @@ class ControlBenchmark:
         control: Online settings that actions change.
         actions: For each discrete action the settings that it asks for, the default first; empty if
             actions are continuous (`SlamEnv`).
-        reward: Of every frame.
+        reward: Reward of every frame.
         frames: Part of each sequence.
         stride: Every so many frames are taken.
     """
@@ -63,8 +63,8 @@ class ControlBenchmark:
 
         Raises:
             SettingsError: No such split or sequence.
-            DynslamError: As `SlamEnv`; a recording that is not there names the command that fetches
-                it.
+            DynslamError: Raised by `SlamEnv`: a sequence, a setting or an argument is unknown or
+                does not fit. A recording that is not there names the command that fetches it.
         """
         from dynslam_bench.envs.slam_env import SlamEnv
         from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler

@@ -135,6 +135,13 @@ def publish(
     ] = "",
     protocol: ProtocolId = "tum-rgbd/v1",
     most_pages: MostPages = None,
+    most_pictures: Annotated[
+        Optional[int],
+        typer.Option(
+            min=0,
+            help="Runs whose page has pictures, 0.4 MB each; default all failures and typical runs.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
@@ -149,6 +156,7 @@ def publish(
             note=remark,
             protocol=protocol,
             most_pages=most_pages,
+            most_pictures=most_pictures,
             on_progress=advance,
         )
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")

@@ -35,7 +35,7 @@ app = typer.Typer(
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
-    assignments: Annotated[
+    set_options: Annotated[
         Optional[list[str]],
         typer.Option(
             "--set",
@@ -43,7 +43,7 @@ def train(
             help="Set one of the training's, e.g. iterations=1200; repeatable.",
         ),
     ] = None,
-    settings: Annotated[
+    settings_file: Annotated[
         Optional[Path],
         typer.Option("--settings", help="TOML file of the training's settings."),
     ] = None,
@@ -61,7 +61,7 @@ def train(
     from dynslam_bench.segmentation.training.settings import TrainSettings
     from dynslam_bench.segmentation.training.train import train as train_network
 
-    chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings))
+    chosen = apply_overrides(TrainSettings(), gather_settings(set_options, settings_file))
     with progress("training") as advance:
         result = train_network(
             chosen,
@@ -84,7 +84,7 @@ def evaluate(
     source: Annotated[
         str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")
     ] = "embedded",
-    assignments: MaskAssignments = None,
+    set_options: MaskAssignments = None,
     output: Annotated[
         Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")
     ] = None,
@@ -101,7 +101,7 @@ def evaluate(
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
     settings = apply_overrides(
-        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+        SegmentationSettings(), {"source": source, **gather_settings(set_options)}
     )
     with progress(data) as advance:
         score = evaluate_segmenter(
@@ -129,7 +129,7 @@ def record(
         Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")
     ],
     source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
-    assignments: MaskAssignments = None,
+    set_options: MaskAssignments = None,
     frames: Frames = None,
     data_root: DataRoot = None,
     camera: Camera = None,
@@ -144,7 +144,7 @@ def record(
     from dynslam_bench.sequences import open_sequence
 
     settings = apply_overrides(
-        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+        SegmentationSettings(), {"source": source, **gather_settings(set_options)}
     )
     opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)
     with progress(f"masks of {opened.id}") as advance:

@@ -152,7 +152,7 @@ def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
 
     Args:
         folder: Where; nothing happens if it is missing.
-        pattern: Of the paths below it to look at, e.g. ``runs/.*``.
+        pattern: Glob pattern below `folder` of the paths to look at, e.g. ``runs/.*``.
     """
     for path in filter(is_temporary, folder.glob(pattern)):
         # it is locked while it is removed: a process that has just made it waits, and makes it again

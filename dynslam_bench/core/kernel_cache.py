@@ -35,7 +35,7 @@ from dynslam_bench.core.module_graph import PACKAGE, module_graph
 UNUSED_S = 30 * 24 * 3600
 """Files that nobody has loaded for so long are removed: the kernels of one state of the sources take some 7 MB."""
 _DIGITS = 32
-"""Of each digest in a name; two of 10^9 states would share 32 hexadecimal digits with a probability of 10^-21."""
+"""Hexadecimal digits of each digest in a name: two of 10^9 states would share 32 with a probability of 10^-21."""
 
 _NO_FOLDER = (OSError, RuntimeError)
 """What is raised where sources cannot be read, or where the user has no home folder."""
@@ -143,7 +143,7 @@ class _Serializer(CompileResultCacheImpl):
 
 
 def _read(file: Path) -> bytes | None:
-    """What a file holds; None if it is missing, cut off, damaged or was written under another name."""
+    """The compiled kernel in a file; None if it is missing, cut off, damaged or was written under another name."""
     try:
         header, _, content = file.read_bytes().partition(b"\n")
     except OSError:

@@ -62,10 +62,10 @@ Reference = tuple[str, str]
 
 @dataclass(frozen=True)
 class ModuleCode:
-    """What is known of one module's source.
+    """One module's source: digest, imports and the names that it imports.
 
     Attributes:
-        digest: Of its syntax, see `syntax_digest`.
+        digest: Digest of the source's syntax, see `syntax_digest`.
         imports: What it imports from this package.
         names: What each name stands for that it imports at its top level, by the name that it has
             in this module.
@@ -306,7 +306,7 @@ def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _references(statement: ast.AST) -> dict[str, Reference]:
-    """What a statement imports from this package, by the name that it gives to it."""
+    """References to this package's names in an import statement, by the name that the statement binds."""
     references: dict[str, Reference] = {}
     if isinstance(statement, ast.Import):
         for alias in statement.names:

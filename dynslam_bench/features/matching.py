@@ -201,7 +201,7 @@ class _SearchFeatures(NamedTuple):
 
 
 class _SearchTargets(NamedTuple):
-    """What features are searched for.
+    """Positions, search radii and descriptors that features are searched for.
 
     Attributes:
         xy: float64 ``[M, 2]``, expected pixels.

@@ -23,8 +23,7 @@ from dynslam_bench.core.ordering import counting_sort
 from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry import at_width, inside
-from dynslam_bench.geometry.camera import STATED_WIDTH
+from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
@@ -135,7 +134,7 @@ class OrbExtractor:
                 image = np.asarray(
                     cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
                 )
-            levels.append(self._corners(image, scale, cell_side(self.settings, gray.shape[1])))
+            levels.append(self._corners(image, scale))
         return levels
 
     def _choose(
@@ -160,10 +159,11 @@ class OrbExtractor:
             missing += quota - len(chosen[-1])
         return chosen[::-1]
 
-    def _corners(self, image: NDArray[np.uint8], scale: float, cell: int) -> _Level:
-        """A level with its FAST corners, and the cell of the grid, of so many pixels, that each lies in."""
+    def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
+        """A level with its FAST corners, and the cell of the grid that each lies in."""
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
+        cell = self.settings.cell_px
         origin = EDGE - 3
         # cells a row, rounded up
         columns = -(-(image.shape[1] - 2 * origin) // cell)
@@ -189,15 +189,6 @@ class OrbExtractor:
             angle[rows] = orientations(level.image, at, _DISC_COLUMNS, _DISC_ROWS)
             descriptors[rows] = rotated_brief(smooth(level.image), at, angle[rows])
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
-
-
-def cell_side(settings: FeatureSettings, width: int) -> int:
-    """Side of the grid's cells in pixels of each level, of an image of a width.
-
-    Narrow images have smaller cells, not larger ones: a weak corner counts only in a cell without a
-    strong one, and few corners would be left.
-    """
-    return max(1, round(at_width(settings.cell_px, min(width, STATED_WIDTH))))
 
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:

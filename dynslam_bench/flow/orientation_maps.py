@@ -126,8 +126,7 @@ def orientation_maps(
     quarter_rows = max(1, height // 4)
     quarter_columns = max(1, width // 4)
 
-    # the arrays of maps that were deleted, where they have the same size; they keep the zeros of
-    # their margins
+    # take the arrays of deleted maps where they have the same size: their margins are zero already
     shapes = (
         (geometry.total, layout.BINS),
         (height + 2 * BORDER, width + 2 * BORDER),
@@ -371,11 +370,12 @@ def blur_cascade(
         pitch: Numbers a line.
         row: The newest source row.
         rows: Rows of the levels.
-        columns: Their columns.
+        columns: Columns of the levels.
         top: First row of the stripe.
         bottom: One past its last row.
         blurs: int64 ``[L, 2]``, taps and distance of each level.
-        reach: Of `level_reach`.
+        reach: int64 ``[L + 1]`` of `level_reach`: rows beyond the stripe that each level must
+            compute.
         first_level: Number of the first of these levels.
         geometry: `layout.MapGeometry`.
         margin: Empty histograms around the maps.

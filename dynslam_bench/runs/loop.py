@@ -134,7 +134,7 @@ def _with_changed_frames(slam: SlamEnv, spec: RunSpec) -> gym.Env[Any, Any]:
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
-    """What is known so far: frames, coverage, the protocol's metrics of the frames so far, median frame time."""
+    """Numbers of the run so far: frames, coverage, the protocol's metrics of the frames so far, median frame time."""
     totals = [timing["total"] for timing in env.timings if timing]
     last = env.episode.outcomes[-1].error
     partial: dict[str, Any] = {

@@ -195,7 +195,7 @@ def open_sequence(
         SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path
             and the command that fetches it), damaged, or no frame in the part asked for.
     """
-    # the whole sequence
+    # open all frames of the sequence
     settings = preprocessing or PreprocessingSettings()
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
@@ -345,7 +345,7 @@ def _open_whole(
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
 
-    # a folder
+    # the name is that of a folder, of a bag, or unknown
     if is_bag(path):
         raise SequenceError(
             f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"
@@ -414,7 +414,12 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         data_root: Folder of the sequences.
 
     Returns:
-        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always
+        One dictionary a sequence: its ``id``, whether it is ``here`` on this machine (rendered ones
+        always are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
+        ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout``
+        says whether the reader was ``verified`` on the publisher's files or ``not verified``;
+        ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before
+        it is fetched, None for what is rendered.
         are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
         ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout`` says
         whether the reader was ``verified`` on the publisher's files or ``not verified``;

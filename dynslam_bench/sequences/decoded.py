@@ -23,7 +23,7 @@ from dynslam_bench.core.fingerprint import opencv_version
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.sequences.view import Wrapped, part_of, reader_of
+from dynslam_bench.sequences.view import Wrapped, reader_of, sequence_part_of
 
 LOG_S = 3.0
 """Decoding that takes longer is logged, every so many seconds."""
@@ -65,7 +65,7 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
     """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
     # the file of this content, of these frames and of the code that decodes them
     cache = StageCache()
-    part = part_of(sequence)
+    part = sequence_part_of(sequence)
     code = [
         module_graph().digest(
             [reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING

@@ -151,7 +151,7 @@ class Map:
 
     Args:
         camera: Intrinsics without distortion.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
 
     Attributes:
         kf_alive: bool ``[S]``, whether the slot is in use.
@@ -187,7 +187,7 @@ class Map:
         n_obs: int32 ``[M]``, number of observations.
         obs_kf: int32 ``[M, O]``, slots of the observing keyframes, oldest first.
         obs_ft: int32 ``[M, O]``, their features.
-        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors
+        substrings: The keyframe's id and sorted substrings of its descriptors, by keyframe slot
             (`relocalisation`).
     """
 
@@ -332,8 +332,8 @@ class Map:
 
         Args:
             number: The submap.
-            T_new_old: From the submap's world to the world of the other, ``[4, 4]``.
-            merged_into: The other's number.
+            T_new_old: Transform ``[4, 4]`` from the submap's world to the world of the other.
+            merged_into: Number of the submap that it becomes part of.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
         # scale the keyframes' translations, then move their poses: T_cam_new = T_cam_old T_new_old^-1
@@ -423,8 +423,9 @@ class Map:
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
         views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
+        to_octave_0 = self.scales / self.scales[0]
         _refresh(
-            points, self._point_views, self.descriptor, self._observation_tables, views, self.scales
+            points, self._point_views, self.descriptor, self._observation_tables, views, to_octave_0
         )
 
     def release(self) -> None:
@@ -517,7 +518,7 @@ def map_outputs(slam_map: Map) -> MapOutputs:
 
 
 def _keyframe_record(slam_map: Map, slot: int) -> KeyframeRecord:
-    """What files hold of a keyframe."""
+    """The record of a keyframe that files hold."""
     return KeyframeRecord(
         int(slam_map.kf_id[slot]),
         int(slam_map.kf_frame[slot]),
@@ -557,7 +558,7 @@ class MapViews:
         }
 
     def of(self, submap: int) -> MapView:
-        """What filters see while the camera is in a submap."""
+        """View that filters get while the camera is in a submap."""
         slam_map = self._map
         if self._computed_for != (slam_map.next_keyframe, submap):
             self._computed_for = slam_map.next_keyframe, submap
@@ -568,7 +569,7 @@ class MapViews:
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
-        """What filters may read of a keyframe."""
+        """The part of a keyframe that filters may read."""
         slam_map = self._map
         n = int(slam_map.kf_count[slot])
         keypoints = Keypoints(

@@ -315,7 +315,7 @@ def _optimise(
         damping = DAMPING
         cost = _linearise(pose, points, measured, inlier, width, camera, h, g)
         for _ in range(iterations):
-            # damped step
+            # a step of Levenberg and Marquardt: the damping grows the diagonal
             work = h.copy()
             for m in range(6):
                 work[m, m] += damping * h[m, m] + 1e-9

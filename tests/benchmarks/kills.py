@@ -179,7 +179,7 @@ class Command:
     """A command and how its result is read.
 
     Attributes:
-        words: Of the command line; ``{target}`` is the folder that it writes.
+        words: Words of the command line; ``{target}`` is the folder that it writes.
         read: Gives its result.
     """
 

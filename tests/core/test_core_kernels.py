@@ -215,7 +215,7 @@ def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:
         like_python(0.0)
 
 
-def test_kernels_release_the_lock(tmp_path: Path) -> None:
+def test_kernels_are_compiled_to_release_the_gil(tmp_path: Path) -> None:
     assert outer_kernel(write_toys(tmp_path / "toys")).targetoptions["nogil"]
 
 

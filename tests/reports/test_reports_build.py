@@ -805,7 +805,7 @@ def test_latex_compiles_and_fits_a_column(odd):
 def test_captions_are_short_and_name_no_ids(odd):
     text = odd.latex.read_text()
     captions = re.findall(r"\\caption\{(.*)\}", text)
-    assert len(captions) > 8
+    assert 3 <= len(captions) <= 12, "a page of tables, not a book"
     for caption in captions:
         assert len(caption) < 140, caption
         assert "tum-rgbd/v1" in caption, caption

@@ -17,7 +17,7 @@ class Checkpoint:
         url: Where it is published.
         sha256_prefix: First digits of its SHA-256, as the publisher gives them in the file name.
         megabytes: Size, for messages.
-        license: Of the weights.
+        license: License of the weights.
         trained_on: Data set.
     """
 

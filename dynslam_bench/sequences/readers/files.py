@@ -541,7 +541,7 @@ def section(value: object, key: str, where: str) -> Any:
 
 
 def numbers(mapping: object, key: str, count: int, where: str) -> list[float]:
-    """The numbers of a list in a mapping, or of a matrix' ``data``.
+    """The numbers of a list in a mapping, or of an OpenCV matrix's ``data``.
 
     Args:
         mapping: What the file holds.
@@ -594,7 +594,7 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     return rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
 
 
-def camera_truth(
+def camera_poses_from_body(
     stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str
 ) -> TumFile | None:
     """The camera's true poses from those of a body, e.g. an IMU: ``T_world_cam = T_world_body @ T_body_cam``.

@@ -45,7 +45,7 @@ class RecordedSequence:
     Args:
         folder: The sequence's folder.
         contents: What its reader found in it.
-        camera: Of the colour images; its `R_body_cam` is applied to the ground truth.
+        camera: Intrinsics of the colour images; its `R_body_cam` is applied to the ground truth.
         id: For example ``tum/fr3/walking_xyz``.
         fps: Nominal frame rate in Hz; None to take it from the stamps, as is done where these
             contradict it.
@@ -63,7 +63,7 @@ class RecordedSequence:
     Attributes:
         folder: The sequence's folder.
         timestamps: Stamps of the colour images in seconds ``[N]``, strictly increasing.
-        timestamps_ns: The same in nanoseconds, int64 ``[N]``.
+        timestamps_ns: Stamps of the colour images in nanoseconds, int64 ``[N]``.
         depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's
             `depth_delay_s` added.
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps;
