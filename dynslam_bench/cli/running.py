@@ -485,7 +485,7 @@ class WatchedRuns:
         self._running: dict[str, int] = {}
         self._ended_runs = 0
         # the newest event's text, for what is said between events
-        self._step = ""
+        self._step = "opening sequences"
         self._kernels_before = set(kernel_files())
 
     def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
@@ -494,7 +494,7 @@ class WatchedRuns:
             progress("frames") as self._advance,
             call_periodically(COMPILED_S, self._say_what_is_compiled),
         ):
-            self._advance(0, None, "opening sequences")
+            self._advance(0, None, self._step)
             return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
 
     def _say_what_is_compiled(self) -> None:
