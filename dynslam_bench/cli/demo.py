@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from dynslam_bench.cli.output import SOME_RUNS_FAILED, note, progress, report_ta
 from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
 from dynslam_bench.core import find_data_root, write_atomic
+from dynslam_bench.core.folders import kernel_files
 from dynslam_bench.core.plugins import python_command
 
 if TYPE_CHECKING:
@@ -45,6 +47,8 @@ MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
 COMPILED = "emfoa-oft?masks=none"
 """The tracker whose kernels are compiled ahead: it uses those of all others, too."""
+POLL_S = 0.5
+"""How often is looked whether all kernels are compiled."""
 KERNEL_FRAMES = 12
 """Frames in which every kernel is used once: keyframes, bundle adjustment, all phases of the flow."""
 
@@ -230,8 +234,12 @@ def compiled_ahead() -> Iterator[None]:
     """
     command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        before = set(kernel_files())
         try:
             yield
-            process.wait()
+            with progress("compiling kernels, once") as advance:
+                while process.poll() is None:
+                    advance(len(set(kernel_files()) - before), None)
+                    time.sleep(POLL_S)
         finally:
             process.kill()

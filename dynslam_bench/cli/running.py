@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,14 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
-from dynslam_bench.core import DynslamError, RunError, label_text, weights_folder
+from dynslam_bench.core import (
+    DynslamError,
+    RunError,
+    call_periodically,
+    label_text,
+    weights_folder,
+)
+from dynslam_bench.core.folders import kernel_files
 
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
@@ -186,6 +194,7 @@ def run(
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
+    announce_recordings(sequences, camera)
     # one specification for each sequence, seed and offset
     specs = make_specs(
         tracker,
@@ -218,6 +227,18 @@ def run(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
     make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
+
+
+def announce_recordings(sequences: list[str], camera: str | None) -> None:
+    """Say what the folders among the sequences are taken for; one that cannot be opened is reported with its run."""
+    from dynslam_bench.sequences import open_sequence
+
+    for name in sequences:
+        if not Path(name).expanduser().is_dir():
+            continue
+        with suppress(DynslamError):
+            for line in getattr(open_sequence(name, camera=camera), "taken_for", ()):
+                announce(line)
 
 
 def default_protocol(tracker: str) -> str:
@@ -433,6 +454,10 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
     return typer.confirm("Download it?", default=True, err=True)
 
 
+COMPILED_S = 1.0
+"""How often is looked for compiled kernels."""
+
+
 class WatchedRuns:
     """The events of runs as a progress bar, and what is known of the runs afterwards.
 
@@ -459,12 +484,29 @@ class WatchedRuns:
         self._done = 0
         self._running: dict[str, int] = {}
         self._ended_runs = 0
+        # the newest event's text, for what is said between events
+        self._step = "opening sequences"
+        self._kernels_before = set(kernel_files())
 
     def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
-        with progress("frames") as self._advance:
-            self._advance(0, None, "opening sequences")
+        with (
+            progress("frames") as self._advance,
+            call_periodically(COMPILED_S, self._say_what_is_compiled),
+        ):
+            self._advance(0, None, self._step)
             return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
+
+    def _say_what_is_compiled(self) -> None:
+        """While no frame is done, how many kernels a system's first run on this machine has compiled."""
+        compiled = len(set(kernel_files()) - self._kernels_before)
+        if compiled and not self._done and not self._running:
+            self._show(f"{self._step}, {compiled} kernels compiled, once")
+
+    def _show(self, step: str) -> None:
+        """Show how many frames are tracked, of all that the runs have."""
+        done = self._done + sum(self._running.values())
+        self._advance(done, self._planned.frames.total() or None, step)
 
     def _plan(self, plan: runs.Plan) -> None:
         self._planned = plan
@@ -481,11 +523,11 @@ class WatchedRuns:
         elif event.partial is not None:
             self._running[event.run_id] = event.partial["frames_done"]
 
-        step = event_text(event)
+        self._step = event_text(event)
         if self._planned.runs > 1:
-            step = f"run {min(self._ended_runs + 1, self._planned.runs)} of {self._planned.runs}, {step}"
-        done = self._done + sum(self._running.values())
-        self._advance(done, self._planned.frames.total() or None, step)
+            number = min(self._ended_runs + 1, self._planned.runs)
+            self._step = f"run {number} of {self._planned.runs}, {self._step}"
+        self._show(self._step)
 
     def _ended(self, event: runs.RunEvent, record: runs.RunRecord) -> None:
         """Remember what a run was asked to open and whether it was stored, and write a line on it."""

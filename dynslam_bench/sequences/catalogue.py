@@ -23,7 +23,14 @@ from dynslam_bench.core import (
 from dynslam_bench.core.plugins import Registry, described, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry import Camera
-from dynslam_bench.sequences.cameras import CAMERA_FILE, CAMERAS, camera_of, chosen_camera
+from dynslam_bench.sequences.cameras import (
+    CAMERA_FILE,
+    CAMERAS,
+    camera_by_name,
+    camera_of,
+    chosen_camera,
+)
+from dynslam_bench.sequences.readers.files import NoRateError
 from dynslam_bench.sequences.readers.layouts import (
     find_layout,
     is_bag,
@@ -272,7 +279,13 @@ def open_folder(
     layout = find_layout(folder, catalogued)
     chosen = chosen_camera(folder, camera)
     fps = (chosen.fps if chosen else None) or (entry.fps if entry else None)
-    contents = layout.read(folder, fps)
+    try:
+        contents = layout.read(folder, fps)
+    except NoRateError:
+        # without a camera, too, one file states both: any rate reads the images that it is made from
+        if chosen is None:
+            camera_of(folder, layout.read(folder, 30.0), None, lacks_rate=True)
+        raise
     notes = layout_notes(folder, layout, catalogued)
     if camera is not None and (folder / CAMERA_FILE).exists():
         notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
@@ -287,6 +300,9 @@ def open_folder(
             "tags": frozenset(entry.tags),
             "split": entry.split,
         }
+    # what says the camera, in the order in which it is looked for
+    named = entry.camera if entry else camera_by_name(folder)
+    source = f"the folder's name ({named})" if contents.camera is None else "the folder's files"
     return RecordedSequence(
         folder,
         contents,
@@ -294,6 +310,8 @@ def open_folder(
         **about,
         fps=contents.fps or fps,
         notes=notes,
+        layout=layout.name,
+        camera_source=source if chosen is None else chosen.source,
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
     )

@@ -611,7 +611,7 @@ def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Cov
 
     Args:
         trajectory: The trajectory.
-        reference: What it is compared with.
+        reference: Stamps and ground truth of the sequence.
         file: Its file, for the error.
 
     Raises:

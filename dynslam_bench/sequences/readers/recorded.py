@@ -54,6 +54,8 @@ class RecordedSequence:
         tags: For example ``high-dynamic``.
         split: ``tune``, ``held-out`` or empty.
         notes: Phrases for `dropped` on how the folder was read.
+        layout: Name of the folder's layout, for `taken_for`.
+        camera_source: What says which camera it is, for `taken_for`.
         max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
         any_depth_size: True if the caller resizes, so that depth images may differ in size from
             colour images.
@@ -70,6 +72,8 @@ class RecordedSequence:
         fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by
             `RATES_CONTRADICT`, the inverse of the median interval (30 for one frame).
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
+        taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
+            unit; ground truth, and all that was not taken as it stands.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -88,6 +92,8 @@ class RecordedSequence:
         tags: frozenset[str] = frozenset(),
         split: str = "",
         notes: tuple[str, ...] = (),
+        layout: str = "",
+        camera_source: str = "",
         max_time_difference_s: float = 0.02,
         any_depth_size: bool = False,
     ) -> None:
@@ -148,6 +154,21 @@ class RecordedSequence:
             rate_note,
         ]
         self.dropped = "; ".join(phrase for phrase in phrases if phrase)
+
+        # what the folder was taken for
+        unit = "depth in metres"
+        if camera.depth_factor is not None:
+            unit = f"{camera.depth_factor:g} raw depth units a metre"
+        of = [str(Path(files[0]).parent) for files in (self._colour, self._depth)]
+        rate = "stated" if fps is not None and not rate_note else "by the stamps"
+        self.taken_for = (
+            f"taken for layout {layout or 'unknown'}: colour in {of[0]}, depth in {of[1]}, {len(self)} frames at "
+            f"{self.fps:.4g} Hz ({rate})",
+            f"camera by {camera_source or 'the caller'}: {camera.width}x{camera.height}, fx {camera.fx:g}, "
+            f"fy {camera.fy:g}, {unit}",
+            "; ".join(phrase for phrase in phrases[1:] if phrase)
+            or "all images and poses are used",
+        )
 
         # most damage shows in the first frame
         self[0]
