@@ -4,7 +4,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,7 @@ class ReportPaths:
         data: All rows, for `compare`.
         leaderboard: The table that the page begins with.
         headline: Its message in one sentence.
+        answers: Who has which error in millimetres, a sentence a category.
         trials: How many runs were left out since they are trials of studies.
     """
 
@@ -122,6 +123,7 @@ class ReportPaths:
     data: Path
     leaderboard: Table
     headline: str
+    answers: list[str] = field(default_factory=list)
     trials: int = 0
 
 
@@ -403,6 +405,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         data=output / REPORT_FILE,
         leaderboard=tables_by_id["leaderboard"],
         headline=headline(content.board),
+        answers=answers(content.board),
         trials=content.trials,
     )
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")

@@ -395,7 +395,7 @@ def show_runs(
 
     Args:
         records: The runs.
-        store: Where they are stored.
+        store: Store that holds the runs.
         protocol: How their errors are evaluated.
         reused: Ids of the runs that are marked as taken from the store.
 

@@ -85,15 +85,18 @@ class KernelCompiler(Compiler):
 def load_kernels() -> None:
     """Load what lies on disk of all kernels, and with it the rest of numba.
 
-    Processes that are forked from this one have it then; else each takes 0.4 s to load it.
+    Processes that are forked from this one have it then; else each takes 0.4 s to load it. Kernels
+    for types that are no longer defined are passed over.
     """
     files = sorted(kernels_folder().glob(f"*{KERNEL_SUFFIX}"))
     for kernel in list(KERNELS.values()):
         prefix = _name_prefix(kernel)
         for file in files:
             content = _read(file) if prefix and file.name.startswith(prefix) else None
-            if content is not None:
-                # the first of the two objects in it: the types
+            if content is None:
+                continue
+            # the first of the two objects in it: the types, of which another version's may be gone
+            with contextlib.suppress(AttributeError, ImportError):
                 kernel.compile(pickle.loads(content))
 
 
@@ -184,7 +187,7 @@ def remove_unused(folder: Path, now: float) -> None:
     """Remove the kernels that nobody has loaded for `UNUSED_S`, and what killed processes left half-written.
 
     Args:
-        folder: Where they lie; it may be missing.
+        folder: Folder of the compiled kernels; it may be missing.
         now: The time, in seconds since the epoch.
     """
     sweep_temporary(folder)

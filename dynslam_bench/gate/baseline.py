@@ -69,7 +69,7 @@ def measurement_of(
         case: Name of what was run.
         number: Number of the round, from 0.
         record: The run.
-        store: Where it is stored.
+        store: Store that holds the run.
         protocol: How it is scored.
     """
     metrics = store.score(record, protocol)

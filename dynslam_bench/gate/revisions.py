@@ -123,7 +123,7 @@ def build(command: str, folder: Path, name: str) -> None:
 
     Args:
         command: For the shell; empty for none.
-        folder: Where it is run.
+        folder: Folder in which the command runs.
         name: What is built, for messages.
 
     Raises:

@@ -107,7 +107,7 @@ class StatedTrajectory(Record):
 
     Attributes:
         file: A trajectory in TUM's format: an address, or a path from the manifest's folder.
-        sha256: SHA-256 of the file, 64 hexadecimal digits.
+        sha256: SHA-256 of the file, 64 hexadecimal digits; empty where it is not known.
         tracker: Name of the system that made it.
         label: Its name in tables.
         sequence: Id of the sequence.
@@ -120,7 +120,7 @@ class StatedTrajectory(Record):
     model_config = ConfigDict(extra="forbid")
 
     file: str = Field(min_length=1)
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
     tracker: str = Field(min_length=1)
     label: str = ""
     sequence: str = Field(min_length=1)

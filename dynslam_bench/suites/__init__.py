@@ -56,7 +56,7 @@ class Suite(Record):
     Attributes:
         name: Its name.
         title: One line for reports.
-        description: What it is for.
+        description: Purpose of the suite.
         trackers: Ids, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
         optional: Trackers that take part only where the packages they need are installed.
         sequences: Ids or folders.

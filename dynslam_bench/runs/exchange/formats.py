@@ -113,7 +113,7 @@ def write_colmap(
     """Write a reconstruction.
 
     Args:
-        folder: Where; it exists.
+        folder: Folder of the reconstruction; it exists.
         trajectory: Camera-to-world poses, one an image.
         camera: The camera of all images.
         names: The image of each pose, relative to the folder of images.
@@ -265,8 +265,8 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     """Write trajectories, each on the topics ``/NAME/pose`` and ``/NAME/path``.
 
     Args:
-        folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its
-            ``metadata.yaml``.
+        folder: Folder that becomes a bag of ROS 2: ``trajectory.mcap`` with its ``metadata.yaml``.
+            It exists.
         trajectories: Camera-to-world poses by name.
 
     Raises:

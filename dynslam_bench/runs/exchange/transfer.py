@@ -418,7 +418,7 @@ def import_trajectory(
 
     # which of its frames the trajectory covers
     coverage = _coverage(trajectory, reference, file)
-    notes += _coverage_notes(coverage, reference, poses=len(trajectory))
+    notes += _coverage_notes(coverage, reference, trajectory)
 
     # its record, as that of a run: frames without a pose count as lost
     identity = _identity_of_import(file, tracker, which, reference.part, timestamps, topic)
@@ -598,12 +598,20 @@ class _Coverage(NamedTuple):
         return cls(poses, poses, n_without_frame, poses - 1)
 
 
+def _share_of_time(stamps: Array, true_stamps: Array) -> float:
+    """The share of the ground truth's time between the first and the last pose; both stamps in seconds."""
+    start = max(float(stamps[0]), float(true_stamps[0]))
+    stop = min(float(stamps[-1]), float(true_stamps[-1]))
+    whole = float(true_stamps[-1] - true_stamps[0])
+    return max(stop - start, 0.0) / whole if whole > 0 else 1.0
+
+
 def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Coverage:
     """Coverage of the reference's frames by a trajectory; each pose is a frame where the frames are not known.
 
     Args:
         trajectory: The trajectory.
-        reference: What it is compared with.
+        reference: Stamps and ground truth of the sequence.
         file: Its file, for the error.
 
     Raises:
@@ -616,21 +624,25 @@ def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Cov
     return _Coverage.of_all(len(trajectory), coverage.n_without_frame)
 
 
-def _coverage_notes(coverage: _Coverage, reference: _Reference, *, poses: int) -> list[str]:
+def _coverage_notes(
+    coverage: _Coverage, reference: _Reference, trajectory: Trajectory
+) -> list[str]:
     """Notes for the record on what is not known of the coverage, and on poses beside the frames.
 
     Args:
         coverage: The coverage.
         reference: The sequence, by its images or by a ground truth alone.
-        poses: Poses of the trajectory.
+        trajectory: The trajectory.
     """
     if not reference.knows_frames:
+        span = _share_of_time(trajectory.timestamps, to_seconds(reference.timestamps_ns))
         return [
-            "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
+            "coverage is unknown: the images of the sequence were not here, and so its frames are not known; "
+            f"from its first to its last pose are {100 * span:.0f} % of the ground truth's time"
         ]
     if coverage.n_without_frame:
         return [
-            f"{coverage.n_without_frame} of {poses} poses carry stamps that are no input frame's"
+            f"{coverage.n_without_frame} of {len(trajectory)} poses carry stamps that are no input frame's"
         ]
     return []
 

@@ -14,7 +14,7 @@ class Checkpoint:
     Attributes:
         id: Short name.
         file: Name in the cache.
-        url: Where it is published.
+        url: Address at which it is published.
         sha256_prefix: First digits of its SHA-256, as the publisher gives them in the file name.
         megabytes: Size, for messages.
         license: License of the weights.

@@ -18,7 +18,7 @@ class Rendering:
     """The stored frames of one rendered sequence.
 
     Attributes:
-        folder: Where they lie.
+        folder: Folder in which they lie.
         size: Size of all files together, bytes.
         is_current: Whether this code reads them, at the default rendering settings.
     """

@@ -87,7 +87,7 @@ class ProgramSetting(Record):
     """A setting as a file declares it; its type is that of its default value.
 
     Attributes:
-        default: What it is where nothing else is said.
+        default: Value where nothing else is said.
         low: Lower end of the range that studies search, inclusive.
         high: Upper end of that range, inclusive.
         limits: What the program takes, where that is wider than the range.
