@@ -22,14 +22,15 @@ people who move between two frames 10 to 150."""
 
 
 def thumbnails(sequence: Sequence) -> list[str]:
-    """Small grey pictures of a few frames of a recording whose camera never moves.
+    """Small grey pictures of a few frames of a recording whose camera never moves: copies of it are found by them.
 
     Args:
         sequence: With its ground truth, cut to what a run shows.
 
     Returns:
         Up to `COUNT` pictures of 16 x 12 pixels, a byte each, in base 64. Empty for rendered scenes,
-        which have digests, for cameras that move, whose true poses tell, and without ground truth.
+        which have digests, for cameras that move, whose true poses tell copies apart, and without
+        ground truth.
     """
     truth = sequence.ground_truth
     is_rendered = hasattr(sequence, "scene_digest")

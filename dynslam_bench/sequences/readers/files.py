@@ -269,7 +269,7 @@ def stamps_of_numbers(
     step = float(np.median(steps)) if steps else 1.0
     likely = _unit_of_steps(step, fps)
     if likely is not None:
-        raise _which_reading(step, fps, likely, files, numbers, folder)
+        raise _ambiguous_numbers_error(step, fps, likely, files, numbers, folder)
 
     # frame numbers: a rate turns them into time
     if fps is None:
@@ -300,7 +300,7 @@ def _unit_of_steps(step: float, fps: float | None) -> str | None:
     return likely if agrees_with_fps or step / fps > _SLOWEST_BY_NUMBER_S else None
 
 
-def _which_reading(
+def _ambiguous_numbers_error(
     step: float, fps: float | None, unit: str, files: list[str], numbers: list[int], folder: Path
 ) -> SequenceError:
     """Names that are frame numbers or stamps: both readings, and the list that decides."""
