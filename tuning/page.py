@@ -354,7 +354,7 @@ def _scenes_figure(
                 hovertemplate="%{y}<br>%{x:.3g} mm<extra>%{fullData.name}</extra>",
             )
         )
-    layout = {
+    layout: dict[str, Any] = {
         "template": {},
         "height": 130 + 22 * len(names),
         "xaxis": mm_axis("absolute trajectory error (mm), left is better"),
