@@ -23,7 +23,7 @@ from numba.core.serialize import dumps
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import sweep_temporary, write_atomic
-from dynslam_bench.core.folders import KERNEL_SUFFIX, kernel_files, kernels_folder
+from dynslam_bench.core.folders import KERNEL_SUFFIX, kernels_folder
 from dynslam_bench.core.kernel_code import (
     Foreign,
     NotDescribedError,
@@ -85,15 +85,18 @@ class KernelCompiler(Compiler):
 def load_kernels() -> None:
     """Load what lies on disk of all kernels, and with it the rest of numba.
 
-    Processes that are forked from this one have it then; else each takes 0.4 s to load it.
+    Processes that are forked from this one have it then; else each takes 0.4 s to load it. Kernels
+    for types that are no longer defined are passed over.
     """
-    files = kernel_files()
+    files = sorted(kernels_folder().glob(f"*{KERNEL_SUFFIX}"))
     for kernel in list(KERNELS.values()):
         prefix = _name_prefix(kernel)
         for file in files:
             content = _read(file) if prefix and file.name.startswith(prefix) else None
-            if content is not None:
-                # the first of the two objects in it: the types
+            if content is None:
+                continue
+            # the first of the two objects in it: the types, of which another version's may be gone
+            with contextlib.suppress(AttributeError, ImportError):
                 kernel.compile(pickle.loads(content))
 
 

@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -146,7 +147,7 @@ def _write_page(
     files = _files(row, output)
     stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
     state = row.store.index.state(row.run_id, row.sequence.part)
-    code = [module_graph().digest([__name__], PLUMBING), protocol.digest(), *share.items()]
+    code = [_own_code(), protocol.digest(), *share.items()]
     beside = None if least is None else [least.error_m, least.label]
     made_of = digest([code, state, stamps, files, pictured, row.notes, row.failed, beside])
     earlier = read_remark(output, name)
@@ -165,6 +166,12 @@ def _write_page(
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
     write_side(output, name, data | {"files": files}, remark=[made_of, *sums])
     return RunPage(row.variant_key, *sums)
+
+
+@cache
+def _own_code() -> str:
+    """Digest of the code that pages are made by."""
+    return module_graph().digest([__name__], PLUMBING)
 
 
 def _copy_pictures(row: RunRow, output: Path) -> list[int]:

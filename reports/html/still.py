@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,14 +14,18 @@ import plotly.graph_objects as go
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import blended_transform_factory
 from plotly.colors import unlabel_rgb
 
 from dynslam_bench.reports.figures import NEUTRAL
 
-WIDTH_INCHES = 9.0
-"""Width of a picture: that of a page of paper between its margins, with room for a legend."""
+WIDTH_INCHES = 9.6
+"""Width of a picture: that of a page of paper between its margins."""
+LETTER_INCHES = 0.07
+"""About the width of a letter of a label: room is left for labels, since to measure them takes a second drawing."""
+LINE_INCHES = 0.17
+"""Height of a line of the legend."""
 PIXELS_PER_INCH = 96
 """What a pixel of a figure's height is on paper, as CSS has it."""
 _MARKERS = {
@@ -39,6 +44,8 @@ _MARKERS = {
 """Symbols of plotly's points to matplotlib's."""
 _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 _POINTS_PER_PIXEL = 0.75
+_NARROW = 6.0
+"""A logarithmic axis that ends below so many times its beginning has evenly spaced labels: 1, 2 and 5 are too few."""
 _STYLE = {
     # letters stay letters, and names with a dollar sign are no formulas
     "svg.fonttype": "none",
@@ -67,12 +74,49 @@ def still(figure: go.Figure) -> str:
         return ""
     height = (figure.layout.height or 420) / PIXELS_PER_INCH
     with matplotlib.rc_context(_STYLE):
-        picture = Figure(figsize=(WIDTH_INCHES, height))
-        _draw(figure, picture.add_subplot())
+        picture = Figure()
+        axes = picture.add_subplot()
+        _draw(figure, axes)
+        _leave_room(picture, axes, height)
         text = io.StringIO()
-        picture.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None})
+        with warnings.catch_warnings():
+            # letters stay letters: the reader's browser has the font, whatever is installed here
+            warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+            picture.savefig(text, format="svg", metadata={"Date": None})
     encoded = base64.b64encode(text.getvalue().encode()).decode()
     return f"data:image/svg+xml;base64,{encoded}"
+
+
+def _leave_room(picture: Figure, axes: Axes, height: float) -> None:
+    """Set the size of a picture, in inches, and the margins that its labels and its legend need."""
+    legend = axes.get_legend()
+    entries = [] if legend is None else [text.get_text() for text in legend.get_texts()]
+    lines = sum(1 + entry.count("\n") for entry in entries)
+    height = max(height, LINE_INCHES * (lines + 4))
+    left = 0.55 + LETTER_INCHES * _longest(label.get_text() for label in axes.get_yticklabels())
+    right = 0.6 + LETTER_INCHES * _longest(entries) if entries else 0.2
+
+    # names along the axis below are turned where they would overlap
+    names = [label.get_text() for label in axes.get_xticklabels()]
+    bottom = 0.55
+    if LETTER_INCHES * sum(len(name) + 2 for name in names) > WIDTH_INCHES - left - right:
+        axes.tick_params("x", labelrotation=30)
+        for label in axes.get_xticklabels():
+            label.set_horizontalalignment("right")
+        bottom += 0.5 * LETTER_INCHES * _longest(names)
+
+    picture.set_size_inches(WIDTH_INCHES, height + bottom)
+    picture.subplots_adjust(
+        left=left / WIDTH_INCHES,
+        right=1 - right / WIDTH_INCHES,
+        bottom=bottom / (height + bottom),
+        top=1 - 0.15 / (height + bottom),
+    )
+
+
+def _longest(labels: Iterable[str]) -> int:
+    """Letters of the longest line of some labels."""
+    return max((len(line) for label in labels for line in label.split("\n")), default=0)
 
 
 def _is_drawn(trace: Any) -> bool:
@@ -90,8 +134,6 @@ def _draw(figure: go.Figure, axes: Axes) -> None:
     y_names = _names(layout.yaxis, [trace.y for trace in figure.data])
     axes.set_xscale("log" if layout.xaxis.type == "log" else "linear")
     axes.set_yscale("log" if layout.yaxis.type == "log" else "linear")
-    _set_labels(axes.xaxis, layout.xaxis, x_names)
-    _set_labels(axes.yaxis, layout.yaxis, y_names)
 
     # the traces; bars of one place stand side by side
     bars = [trace for trace in figure.data if trace.type == "bar"]
@@ -116,6 +158,8 @@ def _draw(figure: go.Figure, axes: Axes) -> None:
         _write_note(axes, note)
 
     # axes
+    _set_labels(axes.xaxis, layout.xaxis, x_names)
+    _set_labels(axes.yaxis, layout.yaxis, y_names)
     axes.set_xlabel(_plain(layout.xaxis.title.text or ""))
     axes.set_ylabel(_plain(layout.yaxis.title.text or ""))
     if layout.yaxis.range is not None and layout.yaxis.type != "log":
@@ -241,9 +285,11 @@ def _set_labels(side: Axis, axis: Any, names: Sequence[str]) -> None:
     if names:
         side.set_ticks(range(len(names)), [_plain(name) for name in names])
     elif axis.type == "log":
-        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        low, high = side.get_view_interval()
+        is_narrow = high < _NARROW * low
+        side.set_major_locator(MaxNLocator(6) if is_narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
         side.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        side.set_minor_formatter(NullFormatter())
+        side.set_minor_locator(NullLocator())
     elif axis.tickvals is not None and axis.ticktext is not None:
         side.set_ticks(axis.tickvals, [_plain(text) for text in axis.ticktext])
 
