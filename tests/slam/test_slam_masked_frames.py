@@ -166,7 +166,7 @@ def test_small_images_of_a_scene_give_poses_nearly_as_exact_as_large_ones(size) 
 def test_the_guard_gives_back_features_beside_the_mask_alone_while_the_camera_is_tracked(
     size,
 ) -> None:
-    wall = Wall(size, masked={6: (0.0, 1.0, 0.06, 1.0)})
+    wall = Wall(size, masked={6: (0.0, 1.0, 0.05, 1.0)})
     results, _ = play(wall)
     result = results[6]
     assert 0 < result.stats["guard_returned"] <= 60
