@@ -49,9 +49,13 @@ LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
 
 
+ASKED_DIGITS = 12
+"""So many digits of a run's id tell what was asked for."""
+
+
 def asked_digest(identity: Mapping[str, Any]) -> str:
     """The first twelve digits of a run's id: what was asked for."""
-    return digest({name: identity[name] for name in ASKED if name in identity}, 12)
+    return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
 
 def run_id_of(identity: Mapping[str, Any]) -> str:
