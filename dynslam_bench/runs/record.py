@@ -18,6 +18,9 @@ RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 """Version of the fields of `MetricRecord`."""
 
+ON_RECORDING = "recording: "
+"""Begins a run's notes on what of its recording was not used, or what nobody could mean."""
+
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
 """How a run ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
@@ -237,7 +240,8 @@ class RunRecord(Record):
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported
             trajectories.
         study: Study that made it, if it was not asked for without the study; else empty.
-        notes: Anything a reader should know, one line each.
+        notes: Anything a reader should know, one line each; those on the recording begin with
+            `ON_RECORDING`.
         files: SHA-256 of the trajectories, the stamps and the ground truth, by the file's name.
     """
 
