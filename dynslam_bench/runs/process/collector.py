@@ -141,6 +141,7 @@ class Notes:
         folders: The names in each folder that was listed; None where it was not there.
         variables: Environment variables that were looked up.
         modules: Top-level names of modules that were imported, or could not be.
+        metadata: Folders with the metadata of distributions whose version was asked for.
         commands: When each command was started first, in nanoseconds since the epoch.
         made: Files that the run has written or removed.
         made_folders: Beginnings of the paths of what lies in folders that it has made.
@@ -152,6 +153,7 @@ class Notes:
     folders: dict[str, list[str] | None] = field(default_factory=dict)
     variables: set[str] = field(default_factory=set)
     modules: set[str] = field(default_factory=set)
+    metadata: set[str] = field(default_factory=set)
     commands: dict[Command, int] = field(default_factory=dict)
     made: set[str] = field(default_factory=set)
     made_folders: tuple[str, ...] = ()
@@ -236,7 +238,10 @@ class Collector:
         links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
         variables |= self._variables_in(files)
-        used_distributions = modules.distributions.keys() | distributions
+        asked_for = {
+            name for name, folder in imports.distributions.items() if folder in self.notes.metadata
+        }
+        used_distributions = modules.distributions.keys() | distributions | asked_for
 
         name = self._anchors.name
         return Reads(
