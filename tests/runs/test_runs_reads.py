@@ -472,6 +472,18 @@ def test_a_variable_that_is_not_set_and_that_a_plug_in_looks_up(look: str, bench
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
+@pytest.mark.parametrize(
+    "copy", ["os.environ.copy()", "dict(os.environ)", "{**os.environ}", "os.environ | {}"]
+)
+def test_a_variable_that_is_not_set_and_looked_up_in_a_copy(copy: str, bench: Bench) -> None:
+    reads = bench.record(
+        f"import os\ndef run():\n    copied = {copy}\n    return copied.get('MY_SLAM_MODE')\n"
+    )
+    assert reads.environment["$MY_SLAM_MODE"] == ""
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
 @pytest.mark.parametrize("look", LOOKS + LISTINGS)
 def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
     bench.environment["MY_SLAM_MODE"] = "fast"

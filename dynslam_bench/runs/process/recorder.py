@@ -277,7 +277,7 @@ class ReadRecorder:
             return
         if _ENVIRONMENT.fullmatch(path):
             if self._is_asked_by_foreign(frame):
-                self._note_variables(self._collector.environment)
+                self._note_all_variables()
             return
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
@@ -465,13 +465,19 @@ class ReadRecorder:
 
     def _on_all_variables(self, frame: FrameType) -> None:
         if self._is_asked_by_foreign(frame.f_back):
-            self._note_variables(self._collector.environment)
+            self._note_all_variables()
 
     def _on_variable_set(self, _: FrameType, name: Any) -> None:
         self._notes.made.add(f"${_variable_name(name)}")
 
     def _on_declared_variable(self, _: FrameType, name: str) -> None:
         self._note_variables([name])
+
+    def _note_all_variables(self) -> None:
+        if not self._notes.has_all_variables:
+            self._notes.has_all_variables = True
+            self._note("all variables", "")
+        self._note_variables(self._collector.environment)
 
     def _note_variables(self, names: Iterable[str]) -> None:
         for name in names:
@@ -586,6 +592,8 @@ class ReadRecorder:
                     self._notes.variables.add(name)
                 case "module":
                     self._notes.modules.add(name)
+                case "all variables":
+                    self._notes.has_all_variables = True
                 case "metadata":
                     self._notes.metadata.add(name)
                 case "command":
