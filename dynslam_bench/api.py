@@ -177,7 +177,7 @@ def make_specs(
         )
     overrides = {**presets.get(preset or "", {}), **(settings or {})}
     return [
-        checked(
+        validated_record(
             RunSpec,
             tracker=tracker,
             sequence=sequence,
@@ -192,11 +192,11 @@ def make_specs(
     ]
 
 
-def checked(kind: type[R], **values: Any) -> R:
-    """A record of values that a user gives.
+def validated_record(kind: type[R], **values: Any) -> R:
+    """Build a pydantic record from a user's values.
 
     Raises:
-        RunError: A value does not fit; names it.
+        RunError: A value does not fit; the error names its field.
     """
     try:
         return kind(**values)
@@ -253,9 +253,9 @@ def bench(
     limits = chosen.limits.model_dump() | {
         name: value for name, value in asked.items() if value is not None
     }
-    every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
+    every = chosen.model_copy(update={"limits": validated_record(Limits, **limits)}).specs(**choice)
     specs = islice(every, shard[0] - 1, None, shard[1])
-    how: dict[str, Any] = {
+    run_many_options: dict[str, Any] = {
         "results": results,
         "protocol": protocol,
         "jobs": jobs,
@@ -265,11 +265,11 @@ def bench(
         "on_fault": on_fault,
     }
     if scheduler is None:
-        return run_specs(specs, **how)
+        return run_specs(specs, **run_many_options)
     with DaskWorkers(scheduler) as workers:
         if on_workers is not None:
             on_workers(workers.describe(chosen.sequences, choice.get("data_root")))
-        return run_specs(specs, executor=workers, **how)
+        return run_specs(specs, executor=workers, **run_many_options)
 
 
 def run_specs(
@@ -277,7 +277,7 @@ def run_specs(
     *,
     results: str | Path = "results",
     protocol: str = DEFAULT_PROTOCOL,
-    **how: Any,
+    **run_many_options: Any,
 ) -> list[RunResult]:
     """Make runs that are given one by one.
 
@@ -285,13 +285,13 @@ def run_specs(
         specs: The runs, e.g. of `make_specs`.
         results: The results folder.
         protocol: How to evaluate.
-        **how: Further arguments of `run_many`.
+        **run_many_options: Further arguments of `run_many`.
 
     Raises:
         DynslamError: See `run_many`.
     """
     store = RunStore(results)
-    records = run_many(specs, results=store, protocol=protocol, **how)
+    records = run_many(specs, results=store, protocol=protocol, **run_many_options)
     return [
         RunResult(run_id, store, protocol)
         for run_id in records.run_ids

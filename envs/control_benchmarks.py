@@ -12,8 +12,6 @@ import gymnasium as gym
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.envs.episode import AccuracyMinusCost
-from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
 
 Split = Literal["train", "test", "recordings"]
 
@@ -33,7 +31,7 @@ class ControlBenchmark:
         control: Online settings that actions change.
         actions: For each discrete action the settings that it asks for, the default first; empty if
             actions are continuous (`SlamEnv`).
-        reward: Of every frame.
+        reward: Reward of every frame.
         frames: Part of each sequence.
         stride: Every so many frames are taken.
     """
@@ -65,9 +63,12 @@ class ControlBenchmark:
 
         Raises:
             SettingsError: No such split or sequence.
-            DynslamError: As `SlamEnv`; a recording that is not there names the command that fetches
-                it.
+            DynslamError: Raised by `SlamEnv`: a sequence, a setting or an argument is unknown or
+                does not fit. A recording that is not there names the command that fetches it.
         """
+        from dynslam_bench.envs.slam_env import SlamEnv
+        from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
+
         splits = {"train": self.train, "test": self.test, "recordings": self.recordings}
         if split not in splits:
             raise SettingsError(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Trajectory
 from dynslam_bench.core import EvaluationError, SettingsError
 from dynslam_bench.core.arguments import names_wrong_arguments
-from dynslam_bench.evaluation import OnlineSample, Protocol, evaluate
 from dynslam_bench.geometry import se3
+
+if TYPE_CHECKING:
+    from dynslam_bench.evaluation import OnlineSample, Protocol
 
 FrameState = Literal["initialising", "ok", "lost", "dropped"]
 
@@ -124,8 +126,8 @@ def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
     """The ``info`` of a step with every key that may be missing: 0 with a flag ``has_<key>`` that is False.
 
     Args:
-        info: Of a step.
-        protocol: Whose metrics are those of the episode.
+        info: The ``info`` dictionary of a step.
+        protocol: Protocol of the episode's metrics.
     """
     missing: dict[str, Any] = {"pose": np.zeros(7)} | dict.fromkeys(_ERRORS, 0.0)
     metrics = _flagged(info.get("episode_metrics", {}), dict.fromkeys(metric_names(protocol), 0.0))
@@ -141,6 +143,8 @@ def _flagged(given: Mapping[str, Any], missing: Mapping[str, Any]) -> dict[str, 
 @cache
 def metric_names(protocol: Protocol) -> tuple[str, ...]:
     """The metrics that an episode may have: those of a long path and of a camera that stands still."""
+    from dynslam_bench.evaluation import evaluate
+
     # twists [2000, 6] of a long path at 30 Hz: translations along a helix, and turns
     stamps = np.arange(2000) / 30.0
     helix = np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0
@@ -167,8 +171,12 @@ def neg_rpe(episode: Episode) -> float:
     error = episode.outcomes[-1].error
     if error is None:
         return 0.0
-    moved = error.frame_trans_m or 0.0
-    return -max(moved - error.lost_way_m, 0.0) if error.tracked else -2.0 * moved
+    # of a frame without a pose this is the true motion: it counts as not having moved
+    motion_error_m = error.frame_trans_m or 0.0
+    if not error.tracked:
+        return -2.0 * motion_error_m
+    # the way of the lost frames was charged already
+    return -max(motion_error_m - error.lost_way_m, 0.0)
 
 
 def neg_pose_error(episode: Episode) -> float:
@@ -203,9 +211,11 @@ class NegWindowError:
         before = episode.outcomes[-1 - self.frames :][0].error
         if now is None or before is None:
             return 0.0
-        moved = se3.inverse(before.T_world_true) @ now.T_world_true
-        estimated = se3.inverse(before.T_world_held) @ now.T_world_held
-        return -float(np.linalg.norm((se3.inverse(moved) @ estimated)[:3, 3]))
+        # motion over the window, from the camera before to the camera now
+        T_true = se3.inverse(before.T_world_true) @ now.T_world_true
+        T_estimated = se3.inverse(before.T_world_held) @ now.T_world_held
+        error = se3.inverse(T_true) @ T_estimated
+        return -float(np.linalg.norm(error[:3, 3]))
 
 
 @names_wrong_arguments
@@ -241,11 +251,11 @@ class AccuracyMinusCost:
         return neg_rpe(episode) - self.charge(episode.outcomes[-1])
 
     def charge(self, outcome: FrameOutcome) -> float:
-        """Metres that a frame's cost counts as."""
+        """Metres that a frame's cost counts as; the weight grows with the frame's index."""
         return self.weight * (1.0 + self.growth * outcome.index) * self.cost_of(outcome)
 
     def cost_of(self, outcome: FrameOutcome) -> float:
-        """What a frame cost, in units of the cost."""
+        """Cost of a frame: network calls, thousands of keypoints, or seconds of the processor."""
         costs: dict[Cost, float] = {
             "network_calls": outcome.stats.get("segmented", 0.0),
             "keypoints": outcome.stats.get("keypoints", 0.0) / 1000.0,

@@ -69,7 +69,9 @@ class Canvas:
 
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
         """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
+        # estimated centres [N, 3] in the first camera's frame, cut where the tracker was lost
         centres, pieces, ate_m = align_to_truth(episode, self._truth)
+        # image and plot side by side, the line of numbers below
         plot = self._plot(centres @ VIEWS[self._view].T, pieces, episode.outcomes[-1].index)
         body = np.concatenate([self.picture(frame, result), plot], axis=1)
         return np.concatenate([body, self._strip(result, episode, ate_m, body.shape[1])], axis=0)
@@ -171,7 +173,7 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
     Args:
         rgb: The image, uint8 ``[H, W, 3]``, red first.
         result: What the tracker said of it.
-        width: Of the result, whose pixels are square as the image's.
+        width: Width of the returned image, pixels; its pixels are square as the image's.
     """
     # the dynamic mask, blended and outlined
     image = np.array(rgb, dtype=np.uint8)
@@ -184,7 +186,7 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
         )
         cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
 
-    # scale
+    # resize the image before anything thin is drawn on it
     size = (width, round(image.shape[0] * scale))
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if result.keypoints_xy is None:

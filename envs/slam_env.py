@@ -109,8 +109,9 @@ class EpisodeState:
     """A copy of an episode in its middle, made by `SlamEnv.clone_state`; it can be restored any number of times.
 
     Attributes:
-        origin: What it is of: sequence, tracker, control, settings and version of this package.
-        parts: The copied attributes.
+        origin: Description by name of everything that it depends on: sequence, tracker, control,
+            settings, reward, protocol, `lost_after` and version of this package.
+        parts: Copies of the environment's attributes that belong to the episode, by name.
     """
 
     origin: Mapping[str, str]
@@ -191,11 +192,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
-    """An environment's own has the frame rate of its sequence, stride included."""
+    """Each environment has its own, with the frame rate of its sequence, stride included."""
     sequence: FrameSequence
     """The frames of the episode."""
     window: tuple[int, int]
-    """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
+    """The episode's frames in the sequence as it was opened: the first, and one past the last."""
 
     @names_wrong_arguments
     def __init__(
@@ -221,9 +222,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         fixed_info: bool = False,
         memory_map: bool = False,
     ) -> None:
+        # keep the arguments: pickling makes the environment again from them
         given = {
             name: value for name, value in locals().items() if name not in ("self", "__class__")
         }
+        # EzPickle keeps the arguments: unpickling makes the environment again
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
         if render_mode not in (None, "rgb_array"):
             raise SettingsError(f"unknown render mode '{render_mode}'", "choose rgb_array")
@@ -241,16 +244,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._parts = observation_parts(observation)
+        self._observation_parts = observation_parts(observation)
         self._observation = observation
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
-        self._length = window
+        self._window_length = window
         self._fixed_info = fixed_info
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
-        self._open = partial(
+        self._open_sequence = partial(
             open_frames,
             data_root=data_root,
             camera=camera,
@@ -258,17 +261,19 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             stride=stride,
             memory_map=memory_map,
         )
+        # a text stays one: `ActionMap` refuses it by what the user wrote, not by its letters
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
 
         # what options of `reset` replace, and the spaces that follow from it
         self._use_settings(settings)
         self._use_sequence(sequence)
+        # fail here where no masks are available, not at frame 0
         segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
         self.observation_space = observation_space(observation, self.sequence.camera)
 
-        # the episode
+        # no episode has begun before the first `reset`
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Canvas | None = None
@@ -472,10 +477,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.close()
         self._canvas = None
         vars(self).update(parts)
-        self.sequence = _part(self._whole, self.window)
+        self.sequence = _frames_of_window(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
-        """What an episode's state depends on, in words; equal where it can be restored."""
+        """Description of everything an episode's state depends on; equal where the state can be restored."""
         whole = self._whole
         frames = digest([whole.digest(), content_digest(whole.timestamps)])
         return {
@@ -602,13 +607,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     @names_wrong_arguments
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
         """Open a sequence and check that tracker, protocol and window fit it."""
-        opened = self._open(sequence, preprocessing=preprocessing_of(self.settings))
+        opened = self._open_sequence(sequence, preprocessing=preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
-        if self._length is not None and self._length > len(opened):
+        if self._window_length is not None and self._window_length > len(opened):
             raise SettingsError(
-                f"a window of {self._length} frames is longer than '{opened.id}', which has {len(opened)} here",
+                f"a window of {self._window_length} frames is longer than '{opened.id}', which has {len(opened)} here",
                 f"give window={len(opened)} or less",
             )
         self.sequence = self._whole = opened
@@ -633,12 +638,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             if preprocessing_of(self.settings) != preprocessing:
                 options = {"sequence": self._source, **options}
 
-        # sequence
+        # another sequence has to fit the observation space, which cannot change
         if "sequence" in options:
             self._use_sequence(options["sequence"])
             size = (camera.width, camera.height)
             new_size = (self.sequence.camera.width, self.sequence.camera.height)
-            if {"rgb", "depth"} & set(self._parts) and size != new_size:
+            if {"rgb", "depth"} & set(self._observation_parts) and size != new_size:
                 raise SequenceError(
                     f"images of {new_size} pixels do not fit the observation space of {size}"
                 )
@@ -647,14 +652,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         window = (0, len(self._whole))
         if options.get("window") is not None:
             window = parse_window(options["window"], self._whole)
-        elif self._length is not None:
-            first = int(self.np_random.integers(window[1] - self._length + 1))
-            window = (first, first + self._length)
+        elif self._window_length is not None:
+            first = int(self.np_random.integers(window[1] - self._window_length + 1))
+            window = (first, first + self._window_length)
         if window != self.window:
             if self._whole.masks is not None:
                 # the tracker may hold the exact masks, which are numbered as the frames
                 self.close()
-            self.sequence = _part(self._whole, window)
+            self.sequence = _frames_of_window(self._whole, window)
             self.window = window
 
     def _build_or_reuse_tracker(self) -> Tracker:
@@ -703,7 +708,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SequenceError: The frame cannot be read, or does not fit the sequence's camera.
             TrackerContractError: The tracker broke its contract.
         """
-        # read
+        # read the frame, with the user's transforms
         index = self.episode.next_index
         read_start = time.perf_counter()
         self._final = None
@@ -712,7 +717,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             frame = transform(frame)
         frame = read_only(frame)
 
-        # track
+        # track it, with wall-clock and processor time; errors inside count as the tracker's
         track_start = time.perf_counter()
         processor_start = time.process_time()
         with tracker_code():
@@ -766,7 +771,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _observe(self) -> Any:
         """The observation of the last tracked frame: the vector for ``stats``, else a dict of parts."""
         progress = self.episode.outcomes[-1].index / max(self._n_frames - 1, 1)
-        observed = observe(self._parts, self.frame, self.result, self.episode, progress)
+        observed = observe(self._observation_parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 
     def _info(self) -> dict[str, Any]:
@@ -777,8 +782,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return fixed_info(info, self.protocol) if self._fixed_info else info
 
 
-def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
-    """The frames of a window."""
+def _frames_of_window(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
+    """The frames ``window[0]`` to ``window[1] - 1`` of a sequence, as a view."""
     if window == (0, len(whole)):
         return whole
     return cast("FrameSequence", SequenceView(whole, *window))

@@ -36,7 +36,7 @@ class ActionMap:
     `control`. With ``u = (a + 1) / 2``:
 
     - float: ``low + u * (high - low)``, or ``low * (high / low) ** u`` on a log scale;
-    - int: the same, rounded to the nearest integer;
+    - int: that number, rounded to the nearest integer;
     - bool and categorical: the ``floor(u * n)``-th of the n choices, each with an equal share of the axis.
 
     A coordinate that is that of the neutral action leaves its setting exactly as it is in
@@ -233,11 +233,11 @@ PRIVILEGED_LAYOUT: tuple[tuple[str, str], ...] = (
         "motion_x",
         "tanh(x / 0.1 m) of the true motion since the previous frame, in the previous camera frame",
     ),
-    ("motion_y", "likewise, y"),
-    ("motion_z", "likewise, z (forward)"),
-    ("motion_rx", "tanh(r / 0.1 rad) of the rotation vector of that motion"),
-    ("motion_ry", "likewise, y"),
-    ("motion_rz", "likewise, z"),
+    ("motion_y", "tanh(y / 0.1 m) of that motion"),
+    ("motion_z", "tanh(z / 0.1 m) of that motion, z is forward"),
+    ("motion_rx", "tanh(rx / 0.1 rad) of the rotation vector of that motion"),
+    ("motion_ry", "tanh(ry / 0.1 rad) of that rotation vector"),
+    ("motion_rz", "tanh(rz / 0.1 rad) of that rotation vector"),
 )
 """Name and meaning of every entry of the part ``privileged``, in order: for a critic, never for the agent itself."""
 
@@ -260,11 +260,11 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
         "motion_x",
         "tanh(x / 0.1 m) of the estimated motion since the previous frame, in the previous camera frame",
     ),
-    ("motion_y", "likewise, y"),
-    ("motion_z", "likewise, z (forward)"),
-    ("motion_rx", "tanh(r / 0.1 rad) of the rotation vector of that motion"),
-    ("motion_ry", "likewise, y"),
-    ("motion_rz", "likewise, z"),
+    ("motion_y", "tanh(y / 0.1 m) of that motion"),
+    ("motion_z", "tanh(z / 0.1 m) of that motion, z is forward"),
+    ("motion_rx", "tanh(rx / 0.1 rad) of the rotation vector of that motion"),
+    ("motion_ry", "tanh(ry / 0.1 rad) of that rotation vector"),
+    ("motion_rz", "tanh(rz / 0.1 rad) of that rotation vector"),
     ("brightness", "mean grey level / 255"),
     ("contrast", "standard deviation of the grey level / 128"),
     ("depth_valid", "share of the pixels with depth"),
@@ -323,7 +323,18 @@ def observation_parts(observation: str | Sequence[str]) -> tuple[str, ...]:
 def observe(
     parts: Iterable[str], frame: Frame, result: TrackResult, episode: Episode, progress: float
 ) -> Any:
-    """The parts of the observation of the last frame, by key; what is asked for alone is computed."""
+    """Observation of the last frame; only the parts that are asked for are computed.
+
+    Args:
+        parts: Names of the parts, see `SlamEnv`.
+        frame: The frame as the tracker saw it.
+        result: The tracker's result on it.
+        episode: The episode up to this frame.
+        progress: Index of the frame over the last index, 0 to 1.
+
+    Returns:
+        Arrays by key; the part ``keypoints`` has two, itself and ``keypoints_mask``.
+    """
     observed: dict[str, Any] = {}
     for part in parts:
         match part:
@@ -370,7 +381,7 @@ def keypoint_tokens(
     tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
     is_keypoint = np.zeros(MOST_KEYPOINTS, np.int8)
 
-    # choose keypoints
+    # choose at most `MOST_KEYPOINTS` keypoints, evenly spread over their list
     xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
     keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
     rows = np.linspace(0, len(xy) - 1, min(len(xy), MOST_KEYPOINTS)).astype(np.intp)
@@ -384,6 +395,7 @@ def keypoint_tokens(
     z = np.nan_to_num(frame.depth[pixels], nan=0.0, posinf=MAX_DEPTH_M).clip(0, MAX_DEPTH_M)
     masked = np.zeros(len(rows)) if result.dynamic_mask is None else result.dynamic_mask[pixels]
 
+    # the columns of `KEYPOINT_LAYOUT`, each in [0, 1]
     columns = [x / width, y / height, z / (z + 3.0), keep[rows], masked]
     tokens[: len(rows)] = np.stack(columns, axis=1).clip(0, 1)
     is_keypoint[: len(rows)] = 1
@@ -391,7 +403,7 @@ def keypoint_tokens(
 
 
 def privileged_observation(episode: Episode) -> NDArray[np.float32]:
-    """What the ground truth says of the last frame, float32 ``[11]`` (`PRIVILEGED_LAYOUT`); 0 where it is silent."""
+    """Errors and true motion of the last frame, float32 ``[11]`` (`PRIVILEGED_LAYOUT`); 0 without ground truth."""
     values = np.zeros(len(PRIVILEGED_LAYOUT))
     now = episode.outcomes[-1].error
     before = episode.outcomes[-2].error if len(episode.outcomes) > 1 else None

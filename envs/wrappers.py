@@ -29,7 +29,7 @@ class SlamWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Args:
         env: A `SlamEnv`, wrapped or not.
-        **arguments: Those of the wrapper's constructor, for the environment's spec.
+        **arguments: Arguments of the wrapper's constructor, for the environment's spec.
 
     Raises:
         SettingsError: It is another environment.
@@ -222,8 +222,8 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``observation="rgbd"``.
-        width: Of the images, pixels; stable-baselines3's convolutions need 36 at least.
-        height: Of the images, pixels, 36 at least for these convolutions.
+        width: Width of the images, pixels; stable-baselines3's convolutions need 36 at least.
+        height: Height of the images, pixels; stable-baselines3's convolutions need 36 at least.
 
     Raises:
         SettingsError: The environment shows no images, or an image would have no pixels.

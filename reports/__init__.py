@@ -11,8 +11,8 @@ cell of the leaderboard:
    (`RunRow.score_m` is the error that ranks).
 2. `model.load.load_runs`: which rows count; rows of unchanged runs come from the store's index.
    `model.programs.choose_runs`: of which program, and which programs share a row.
-3. `model.board.make_board`: rows of one tracker and sequence become a `Cell` (`Cell.median`); `rank` makes a
-   `Standing` of a tracker's cells with `model.statistics.standings`.
+3. `model.board.make_board`: rows of one tracker and sequence become a `TrackerOnSequence`, whose error is its `median`;
+   `rank` makes a `Standing` of a tracker's cells with `model.statistics.standings`.
 4. `tables.leaderboard`: a `TableCell` for each of these numbers (`leaderboard`, `per_sequence`, `metric_table`).
 5. `build_report`: the tables as sections of the page, and as files.
 """

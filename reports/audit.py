@@ -23,11 +23,11 @@ from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers
 OURS = "EMFOA-OFT-SLAM"
 """The paper's own method, as its tables name it."""
 _HALF_DIGIT = 0.5
-"""By how much a printed number may be rounded, in units of its last digit."""
+"""Largest rounding of a printed number, in units of its last digit."""
 _PERCENT_TOLERANCE = 0.001
-"""By how much an improvement may differ from what follows from the table, in percent."""
+"""Largest difference of an improvement from what follows from the table, percent."""
 _ERROR_TOLERANCE = 0.25
-"""By how much an error may differ from 100 times the StD to count as the same number."""
+"""Largest difference of an error from 100 times the StD to count as the same number."""
 _MASK_RCNN_MS = 195.0
 """Published time of DynaSLAM's Mask R-CNN, in milliseconds."""
 

@@ -3,8 +3,8 @@
 import re
 import shlex
 import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from dynslam_bench.reports.html.page import (
 from dynslam_bench.reports.html.run_pages import (
     RUN_PAGE,
     SHARE_EDGES,
+    LeastError,
     RunPage,
     error_by_share,
     write_run_pages,
@@ -39,13 +40,14 @@ from dynslam_bench.reports.html.run_pages import (
 from dynslam_bench.reports.model.answers import (
     MEANINGS,
     answers,
+    cell_error_m,
     error_columns,
     limits,
 )
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
-    On,
+    RankingBasis,
     category_boards,
     copies_note,
     make_board,
@@ -53,7 +55,7 @@ from dynslam_bench.reports.model.board import (
     missing_note,
 )
 from dynslam_bench.reports.model.load import (
-    Loaded,
+    LoadedRuns,
     OnProgress,
     load_for_report,
     no_progress,
@@ -109,6 +111,7 @@ class ReportPaths:
         data: All rows, for `compare`.
         leaderboard: The table that the page begins with.
         headline: Its message in one sentence.
+        answers: Who has which error in millimetres, a sentence a category.
         trials: How many runs were left out since they are trials of studies.
     """
 
@@ -120,18 +123,17 @@ class ReportPaths:
     data: Path
     leaderboard: Table
     headline: str
+    answers: list[str] = field(default_factory=list)
     trials: int = 0
 
 
-_NOT_IN_LATEX = ("machines", "failures")
-"""Ids of tables that no paper would show."""
 Fact = tuple[str, str, list[str]]
 """A number, what it counts, and its details."""
 
 
 @dataclass(frozen=True)
 class _Content:
-    """What a report shows, before it is written.
+    """Content of a report before it is written.
 
     Attributes:
         title: Heading.
@@ -179,10 +181,11 @@ def build_report(
     *,
     protocol: Protocol | str = "tum-rgbd/v1",
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     rank_seen: bool = False,
     trials: bool = False,
     most_pages: int | None = None,
+    most_pictures: int | None = None,
     title: str = "Visual SLAM in dynamic scenes",
     command: str = "",
     on_progress: OnProgress = no_progress,
@@ -206,6 +209,8 @@ def build_report(
             counted.
         most_pages: Runs that have a page of their own, typical ones of their cells first; None for
             `pages_for`.
+        most_pictures: Runs whose page has pictures, typical ones first; None for all failures and
+            typical runs. Without pictures a page has the track and the curves.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -231,8 +236,14 @@ def build_report(
         typical = board.typical
         paged = _choose_paged(board, typical, most_pages)
         paged_ids = {row.run_id for row in paged}
-        pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
-        run_pages = write_run_pages(paged, pictured, protocol, output, pool, on_page)
+        shown = [row for row in paged if row.failed or row.run_id in typical]
+        if most_pictures is not None:
+            # typical runs first
+            shown.sort(key=lambda row: row.run_id not in typical)
+            shown = shown[:most_pictures]
+        pictured = {row.run_id for row in shown}
+        least = _least_errors(board)
+        run_pages = write_run_pages(paged, pictured, protocol, output, least, pool, on_page)
 
     # put the tables and figures together
     on_progress(0, None, "putting the tables and figures together")
@@ -274,12 +285,30 @@ def build_report(
     return _write(content, output)
 
 
-def _monocular_boards(loaded: Loaded, boards: Mapping[str, Board]) -> dict[str, Board]:
+def _least_errors(board: Board) -> dict[str, LeastError]:
+    """The least median error of a ranked tracker on every sequence, by `RunRow.sequence_key`."""
+    least: dict[str, LeastError] = {}
+    for row in board.rows:
+        name = board.sequence(row)
+        if row.sequence_key in least:
+            continue
+        errors = []
+        for key in board.ranked:
+            cell = board.cells[key].get(name)
+            error_m = None if cell is None else cell_error_m(cell)
+            if error_m is not None:
+                errors.append((error_m, board.labels[key]))
+        if errors:
+            least[row.sequence_key] = LeastError(*min(errors))
+    return least
+
+
+def _monocular_boards(loaded: LoadedRuns, boards: Mapping[str, Board]) -> dict[str, Board]:
     """Category to the board of the monocular trackers that were run on its sequences."""
     apart = {}
     for category, part in boards.items():
-        columns = {row.column_id for row in part.rows}
-        rows = [row for row in loaded.monocular if row.column_id in columns]
+        columns = {row.sequence_key for row in part.rows}
+        rows = [row for row in loaded.monocular if row.sequence_key in columns]
         if category == OVERALL:
             rows = loaded.monocular
         if rows:
@@ -295,7 +324,7 @@ def pages_for(runs: int, typical: int) -> int:
 
     Args:
         runs: Runs of the report.
-        typical: Those of them with the median error of their cell.
+        typical: Runs among them that have the median error of their cell.
     """
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
@@ -333,7 +362,7 @@ def _pageless_note(pages: int, runs: int) -> str:
     if pages == runs:
         return ""
     return (
-        f"{runs - pages} of {runs} runs have no pictures and no course over time here: {pages} have, those with the "
+        f"{runs - pages} of {runs} runs have no track and no curves here: {pages} have, those with the "
         f"median error of their cell first. report --most-pages {runs} shows all. The tables count all runs."
     )
 
@@ -376,6 +405,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         data=output / REPORT_FILE,
         leaderboard=tables_by_id["leaderboard"],
         headline=headline(content.board),
+        answers=answers(content.board),
         trials=content.trials,
     )
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
@@ -386,13 +416,11 @@ def _write(content: _Content, output: Path) -> ReportPaths:
     for name, table in tables_by_id.items():
         write_atomic(paths.csv[name], csv_text(table.frame()))
     write_atomic(paths.csv["runs"], csv_text(content.board.frame()))
-    write_atomic(paths.markdown, _markdown(content, tables_by_id.values(), facts, footer))
-    latex_tables = [
-        to_latex(table, content.protocol.id)
-        for name, table in tables_by_id.items()
-        if name not in _NOT_IN_LATEX
-    ]
-    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex_tables))
+    write_atomic(paths.markdown, _markdown(content, tables_by_id, facts, footer))
+    few = _paper_tables(tables_by_id, content.protocol)
+    latex_tables = [to_latex(table, content.protocol.id) for table in few]
+    head = "% needs \\usepackage{booktabs}; all other tables: csv/\n"
+    write_atomic(paths.latex, head + "\n".join(latex_tables))
     ReportData(
         title=content.title,
         protocol=content.protocol.describe(),
@@ -401,7 +429,7 @@ def _write(content: _Content, output: Path) -> ReportPaths:
         rows=content.board.rows,
     ).write(paths.data)
 
-    # the pages
+    # write the pages of the report
     write_assets(output)
     write_atomic(paths.html, _first_page(content, facts, footer))
     for page in content.sections:
@@ -422,8 +450,19 @@ def _write(content: _Content, output: Path) -> ReportPaths:
     return paths
 
 
-def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], footer: str) -> str:
-    """Headline, facts, notes and tables as Markdown."""
+def _paper_tables(tables_by_id: Mapping[str, Table], protocol: Protocol) -> list[Table]:
+    """The few tables that a paper shows: the board, errors by sequence and category, the first relative error."""
+    names = ["leaderboard", "per_sequence", "categories"]
+    names += [f"rpe_{spec.key}_trans" for spec in protocol.rpe[:1]]
+    return [table for name, table in tables_by_id.items() if name in names]
+
+
+def _markdown(
+    content: _Content, tables_by_id: Mapping[str, Table], facts: Sequence[Fact], footer: str
+) -> str:
+    """Headline, facts, notes and the few tables of a paper as Markdown, with the failures."""
+    shown = _paper_tables(tables_by_id, content.protocol)
+    shown += [table for name, table in tables_by_id.items() if name == "failures"]
     board = content.board
     counts = ", ".join(f"{value} {name}" for value, name, _ in facts)
     notes = [how_to_read(board), *content.notes[OVERALL], *content.common_notes]
@@ -433,7 +472,12 @@ def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], 
     opening = "\n\n".join(prose(sentence) for sentence in said)
     head = f"# {prose(content.title)}\n\n{opening}\n\n{content.protocol.describe()}\n\n{counts}\n\n"
     quoted = "".join(f"> {prose(note)}\n\n" for note in notes)
-    return head + quoted + "\n".join(map(to_markdown, shown)) + f"\n{footer}\n"
+    return (
+        head
+        + quoted
+        + "\n".join(map(to_markdown, shown))
+        + f"\nAll other tables: csv/.\n\n{footer}\n"
+    )
 
 
 def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
@@ -456,6 +500,7 @@ def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
     charts = {"speed": figures.speed_figure(board)}
     for number, part in enumerate(boards.values()):
         charts[f"errors-{number}"] = figures.error_figure(part)
+        charts[f"below-{number}"] = figures.cumulative_figure(part)
     return render(
         "board.html.j2",
         title=content.title,
@@ -578,7 +623,7 @@ _MOST_COMMANDS = 200
 """Commands that are shown."""
 
 
-def _board_notes(board: Board, loaded: Loaded) -> list[str]:
+def _board_notes(board: Board, loaded: LoadedRuns) -> list[str]:
     """What a reader has to know about the ranking of a category: gaps, and what is not ranked."""
     notes = [missing_note(board), copies_note(board)]
     if board.final_only:
@@ -594,7 +639,7 @@ def _board_notes(board: Board, loaded: Loaded) -> list[str]:
     return [note for note in notes if note]
 
 
-def _common_notes(protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
+def _common_notes(protocol: Protocol, loaded: LoadedRuns, pageless: str) -> list[str]:
     """What a reader has to know about all categories: contradictions, and what is left out."""
     notes = []
     if loaded.conflicts:
@@ -616,7 +661,7 @@ def _common_notes(protocol: Protocol, loaded: Loaded, pageless: str) -> list[str
     return [note for note in notes if note]
 
 
-def _left_out_note(loaded: Loaded) -> str:
+def _left_out_note(loaded: LoadedRuns) -> str:
     """How many runs are in no table, by reason; empty for none."""
     left_out = {
         "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
@@ -627,7 +672,7 @@ def _left_out_note(loaded: Loaded) -> str:
     return f"Left out: {counts}." if counts else ""
 
 
-def _program_notes(board: Board, loaded: Loaded) -> list[str]:
+def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
     """What is to be said where several programs made runs of one tracker."""
     notes = []
     others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
@@ -758,7 +803,7 @@ def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
     return Section("share", "Error against the share of people", blocks=blocks)
 
 
-def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
+def provenance_section(board: Board, loaded: LoadedRuns, again: str) -> Section:
     """Machines, versions, the commands that reproduce it, and the diagnostics of the runs.
 
     Args:
@@ -766,7 +811,7 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
         loaded: What was read from the stores.
         again: The command that makes this report again.
     """
-    # commands
+    # commands that made the runs, each once
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     codes = {
@@ -853,7 +898,7 @@ class Site:
     Attributes:
         index: Its first page.
         files: How many files it has.
-        size_mb: Their size in MB.
+        size_mb: Size of all files in MB.
     """
 
     index: Path
@@ -870,6 +915,7 @@ def publish(
     note: str = "",
     protocol: Protocol | str = "tum-rgbd/v1",
     most_pages: int | None = None,
+    most_pictures: int | None = None,
     on_progress: OnProgress = no_progress,
 ) -> Site:
     """Make the report of some results folders, take the pages of studies beside it, and write a first page for all.
@@ -885,8 +931,10 @@ def publish(
         title: Heading.
         note: What a reader should know, shown on the first page.
         protocol: How to evaluate.
-        most_pages: As in `build_report`; the pictures of a run take about 0.4 MB.
-        on_progress: As in `build_report`.
+        most_pages: Runs that have a page of their own, see `build_report`; a page takes about 30 kB.
+        most_pictures: Runs whose pictures are shown, see `build_report`; the pictures of a run take
+            about 0.4 MB.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
 
     Raises:
         ReportError: There are no runs, or the folder of a study holds no page.
@@ -909,6 +957,7 @@ def publish(
         title=title,
         command="dynslam-bench report RESULTS",
         most_pages=most_pages,
+        most_pictures=most_pictures,
         on_progress=on_progress,
     )
     # the rows are for work with the results, not for looking at them

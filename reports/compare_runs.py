@@ -23,7 +23,7 @@ from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.html.board_page import cell_data, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import Cell, copies_of, make_cell, mean_of
+from dynslam_bench.reports.model.board import TrackerOnSequence, copies_of, make_cell, mean_of
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
@@ -31,7 +31,7 @@ from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, num
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
 
-Paired = tuple[str, Cell, Cell]
+Paired = tuple[str, TrackerOnSequence, TrackerOnSequence]
 """A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs in A and in B."""
 Variants = Mapping[str, list[RunRow]]
 """Variant key of a tracker to its rows."""
@@ -39,7 +39,7 @@ Variants = Mapping[str, list[RunRow]]
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from A to B.
+    """Changes from A to B: every tracker's errors on the common sequences, and the verdict.
 
     Attributes:
         overall: Tracker and what differs to B's median ATE over A's: the typical ratio over
@@ -79,8 +79,8 @@ def compare(
     the fewest values.
 
     Args:
-        a: Results folder, store, or folder of a report (``report.json``).
-        b: The other results folder, store, or folder of a report.
+        a: First side: a results folder, a store, or the folder of a report (``report.json``).
+        b: Second side, named in one of these ways.
         protocol: How results folders are evaluated; a report brings its own.
         output: Folder of a page that shows it; None for none.
         conclusion: What the page says in place of the verdict, where another rule judged the runs.
@@ -196,7 +196,7 @@ def _write_page(
     output = output.expanduser().absolute()
 
     # label to sequence to cell; every tracker is listed twice, first in A and then in B
-    cells: dict[str, dict[str, Cell]] = {}
+    cells: dict[str, dict[str, TrackerOnSequence]] = {}
     for name, pairs in compared.items():
         cells[f"A: {name}"] = {sequence: cell_a for sequence, cell_a, _ in pairs}
         cells[f"B: {name}"] = {sequence: cell_b for sequence, _, cell_b in pairs}
@@ -241,7 +241,7 @@ def _write_page(
 
 
 def _board_data(
-    cells: Mapping[str, Mapping[str, Cell]], evaluated: str, paged: Collection[str]
+    cells: Mapping[str, Mapping[str, TrackerOnSequence]], evaluated: str, paged: Collection[str]
 ) -> dict[str, Any]:
     """What ``data/board.js`` holds, see `html.board_page.board_data`; of every cell the typical run is listed.
 
@@ -291,7 +291,7 @@ def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRo
 
 def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
     """Column id to the rows of it."""
-    return grouped(rows, lambda row: row.column_id)
+    return grouped(rows, lambda row: row.sequence_key)
 
 
 def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
@@ -339,7 +339,7 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
     return words
 
 
-def ratio_of(a: Cell, b: Cell) -> float | None:
+def ratio_of(a: TrackerOnSequence, b: TrackerOnSequence) -> float | None:
     """B's median error over A's; None where one of them has none: lost before a fixed camera."""
     if a.median is None or b.median is None:
         return None
@@ -374,7 +374,7 @@ def _numbers(ratio: PairedRatio) -> list[float | None]:
 
 
 def _sentence(ratio: PairedRatio) -> str:
-    """What was found, as the page says it."""
+    """The finding in a sentence, as the page says it."""
     return f"{'. '.join(findings(ratio, 'B'))}. Verdict: {verdict_of(ratio).value}."
 
 
@@ -427,13 +427,13 @@ def _table(
     return Table("paired", title, caption, columns, rows, separators=separators - {0})
 
 
-def _error_cell(cell: Cell) -> TableCell:
+def _error_cell(cell: TrackerOnSequence) -> TableCell:
     """The median error of runs, in millimetres, and whether the cell is lost."""
     text = "" if cell.median is None else mm(cell.median)
     return TableCell(text, "lost" if cell.lost else "", cell.median)
 
 
-def _coverage_cell(cell: Cell) -> TableCell:
+def _coverage_cell(cell: TrackerOnSequence) -> TableCell:
     """The mean coverage of runs."""
     coverage = mean_of(row.coverage for row in cell.rows)
     return TableCell(coverage_text(coverage), value=coverage)

@@ -43,6 +43,8 @@ DASHES = ("solid", "dash", "dot", "dashdot")
 """Styles of trackers' lines."""
 NEUTRAL = "#8a8a8a"
 """Colour of axes, guides and true paths."""
+_FEWEST_IN_CURVE = 4
+"""Sequences below which a curve over them says no more than the points do."""
 MOST_POINTS = 400
 """Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 
@@ -132,6 +134,13 @@ def log_axis(title: str) -> dict[str, Any]:
     return {"type": "log", "title": title, "minexponent": 5}
 
 
+def mm_axis(title: str) -> dict[str, Any]:
+    """A logarithmic axis of errors in millimetres, with labels at 1, 2, 5, 10 and so on, written in full."""
+    labels = [f * 10.0**power for power in range(-3, 6) for f in (1, 2, 5)]
+    texts = [f"{value:g}" for value in labels]
+    return log_axis(title) | {"tickmode": "array", "tickvals": labels, "ticktext": texts}
+
+
 GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"}, "layer": "below"}
 """A dashed line across a figure at one value."""
 
@@ -217,46 +226,20 @@ def error_figure(board: Board) -> go.Figure | None:
     for key in [*board.trackers, *board.final_only]:
         present = [name for name in names if name in board.cells[key]]
         cells = {name: board.cells[key][name] for name in present}
-        errors_m = {name: error for name in present if (error := cell_error_m(cells[name]))}
-        if not errors_m:
+        errors_mm = {
+            name: 1000.0 * error for name in present if (error := cell_error_m(cells[name]))
+        }
+        if not errors_mm:
             continue
         line = wrapped(board.names[key])
         lines.append(line)
-        is_open = key not in board.ranked
-        symbols = [
-            "x" if cells[name].lost else look[key]["symbol"] + "-open" * is_open
-            for name in errors_m
-        ]
-        traces.append(
-            go.Scatter(
-                x=rounded([1000.0 * error for error in errors_m.values()]),
-                y=[line] * len(errors_m),
-                mode="markers",
-                marker={"size": 9, "color": look[key]["color"], "symbol": symbols},
-                customdata=[run_link(cells[name].typical) for name in errors_m],
-                text=[safe(board.short.get(name, name)) for name in errors_m],
-                hovertemplate="%{text}<br>%{x:.4g} mm<extra></extra>",
-            )
-        )
-        traces.append(
-            go.Scatter(
-                x=rounded([1000.0 * float(np.median(list(errors_m.values())))]),
-                y=[line],
-                mode="markers",
-                marker={
-                    "size": 20,
-                    "color": look[key]["color"],
-                    "symbol": "line-ns",
-                    "line": {"width": 3, "color": look[key]["color"]},
-                },
-                hovertemplate="median %{x:.4g} mm<extra></extra>",
-            )
-        )
+        traces.append(_error_points(board, key, line, errors_mm, look[key]))
+        traces.append(_median_bar(line, float(np.median(list(errors_mm.values()))), look[key]))
     figure = figure_of(
         traces,
         110 + 30 * len(lines),
         showlegend=False,
-        xaxis=log_axis("absolute trajectory error (mm), left is better"),
+        xaxis=mm_axis("absolute trajectory error (mm), left is better"),
         # below the last tracker there is room for the label of the static camera
         yaxis={
             "categoryorder": "array",
@@ -264,28 +247,129 @@ def error_figure(board: Board) -> go.Figure | None:
             "range": [-1.0, len(lines) - 0.5],
         },
     )
+
+    # a guide where a camera that does not move stands
     static_m = [board.static_camera[name] for name in names if board.static_camera[name] > 0]
     if figure is not None and static_m:
-        static_mm = 1000.0 * float(np.median(static_m))
-        # an invisible point on the line: axes are fitted to points, not to lines
-        blank = go.Scatter(x=[static_mm], y=lines[:1], mode="markers", opacity=0, hoverinfo="skip")
-        figure.add_trace(blank)
-        figure.add_vline(static_mm, **GUIDE)
-        # annotations on a logarithmic axis take the logarithm of their place
-        figure.add_annotation(
-            x=float(np.log10(static_mm)),
-            y=0.0,
-            yref="paper",
-            text="not moving",
-            xanchor="right",
-            yanchor="bottom",
-            showarrow=False,
-        )
+        _add_static_camera(figure, 1000.0 * float(np.median(static_m)), lines[:1])
     return figure
 
 
+def _error_points(
+    board: Board, key: str, line: str, errors_mm: Mapping[str, float], look: Mapping[str, str]
+) -> go.Scatter:
+    """A point for each error of a tracker.
+
+    Args:
+        board: The board.
+        key: Variant key of the tracker.
+        line: Its line in the figure.
+        errors_mm: Error in millimetres by sequence.
+        look: Its colour and symbol.
+    """
+    cells = board.cells[key]
+    symbol = look["symbol"] if key in board.ranked else f"{look['symbol']}-open"
+    return go.Scatter(
+        x=rounded([*errors_mm.values()]),
+        y=[line] * len(errors_mm),
+        mode="markers",
+        marker={
+            "size": 9,
+            "color": look["color"],
+            "symbol": ["x" if cells[name].lost else symbol for name in errors_mm],
+        },
+        customdata=[run_link(cells[name].typical) for name in errors_mm],
+        text=[safe(board.short.get(name, name)) for name in errors_mm],
+        hovertemplate="%{text}<br>%{x:.4g} mm<extra></extra>",
+    )
+
+
+def _median_bar(line: str, median_mm: float, look: Mapping[str, str]) -> go.Scatter:
+    """A bar across a tracker's line at the median of its errors, millimetres."""
+    return go.Scatter(
+        x=rounded([median_mm]),
+        y=[line],
+        mode="markers",
+        marker={
+            "size": 20,
+            "color": look["color"],
+            "symbol": "line-ns",
+            "line": {"width": 3, "color": look["color"]},
+        },
+        hovertemplate="median %{x:.4g} mm<extra></extra>",
+    )
+
+
+def _add_static_camera(figure: go.Figure, static_mm: float, first_line: list[str]) -> None:
+    """Draw the median error of a camera that does not move, with a label at the bottom.
+
+    Args:
+        figure: The figure.
+        static_mm: Error of a static camera, millimetres.
+        first_line: The first line of the figure, in a list of one.
+    """
+    # an invisible point on the line: axes are fitted to points, not to lines
+    blank = go.Scatter(x=[static_mm], y=first_line, mode="markers", opacity=0, hoverinfo="skip")
+    figure.add_trace(blank)
+    figure.add_vline(static_mm, **GUIDE)
+    # annotations on a logarithmic axis take the logarithm of their place
+    figure.add_annotation(
+        x=float(np.log10(static_mm)),
+        y=0.0,
+        yref="paper",
+        text="not moving",
+        xanchor="right",
+        yanchor="bottom",
+        showarrow=False,
+    )
+
+
+def cumulative_figure(board: Board) -> go.Figure | None:
+    """The share of sequences with an error below that of the axis, a line a tracker; None without two sequences.
+
+    As the ETH3D benchmark draws it (Schops et al. 2019). A sequence without a number, since all runs failed or
+    there were none, is below no error.
+    """
+    names = board.common or board.sequences
+    if len(names) < _FEWEST_IN_CURVE:
+        return None
+    look = looks(board)
+    errors_mm: dict[str, list[float]] = {}
+    for key in [*board.trackers, *board.final_only]:
+        of_sequence = board.cells[key]
+        cells = [of_sequence[name] for name in names if name in of_sequence]
+        measured = [1000.0 * error for cell in cells if (error := cell_error_m(cell))]
+        if measured:
+            errors_mm[key] = sorted(measured)
+    if not errors_mm:
+        return None
+
+    # each curve begins at no sequence and goes on to the largest error of all
+    largest_mm = max(values[-1] for values in errors_mm.values())
+    traces = []
+    for key, values in errors_mm.items():
+        shares = [100.0 * (at + 1) / len(names) for at in range(len(values))]
+        traces.append(
+            go.Scatter(
+                x=rounded([values[0], *values, largest_mm]),
+                y=rounded([0.0, *shares, shares[-1]]),
+                mode="lines",
+                name=wrapped(board.names[key]),
+                line={"color": look[key]["color"], "dash": look[key]["dash"], "shape": "hv"},
+                hovertemplate="%{y:.0f} % below %{x:.4g} mm<extra>%{fullData.name}</extra>",
+            )
+        )
+    return figure_of(
+        traces,
+        max(340, 110 + 30 * len(traces)),
+        showlegend=True,
+        xaxis=mm_axis("absolute trajectory error (mm)"),
+        yaxis={"title": "sequences below it (%)", "range": [0, 103]},
+    )
+
+
 def _pareto_front(points: Collection[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Those of some speeds and ratios that no other beats in both, the slowest first."""
+    """Points (speed, ratio) that no other point beats in both, the slowest first."""
     front = []
     for speed, ratio in points:
         others = [point for point in points if point != (speed, ratio)]
@@ -337,7 +421,7 @@ def mask_figure(board: Board) -> go.Figure | None:
         max(420, 110 + 21 * len(traces)),
         showlegend=True,
         xaxis=overlap,
-        yaxis=log_axis("ATE (mm)"),
+        yaxis=mm_axis("ATE (mm)"),
     )
 
 
@@ -368,7 +452,7 @@ def share_figure(
         if any(error_mm is not None for error_mm, _ in bins.get(key, []))
     ]
     shares = {"title": "share of the image that shows people (%)", "type": "category"}
-    errors = log_axis("frame-to-frame error, RMSE (mm)")
+    errors = mm_axis("frame-to-frame error, RMSE (mm)")
     return figure_of(
         traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors
     )

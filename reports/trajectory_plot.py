@@ -38,8 +38,8 @@ class PlottedTrajectory:
     Attributes:
         label: Name in the legend.
         aligned: Estimated poses with ground truth, aligned to it as the protocol has it.
-        errors_m: Their absolute translation errors in metres ``[N]``.
-        rmse_m: Their root mean square in metres.
+        errors_m: Absolute translation errors of these poses, metres ``[N]``.
+        rmse_m: Root mean square of these errors, metres.
     """
 
     label: str

@@ -61,7 +61,7 @@ class RetryingStorage(BaseStorage):
         url: The address of its database, for messages.
 
     Raises:
-        StudyError: Of each method: the database has not answered for `MAX_RETRY_S`.
+        StudyError: Raised by every method: the database has not answered for `MAX_RETRY_S`.
     """
 
     def __init__(self, storage: BaseStorage, url: str) -> None:

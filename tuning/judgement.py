@@ -3,10 +3,11 @@
 import json
 import math
 import re
+import shlex
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, geometric_mean
 from typing import Any
 
 from optuna.trial import FrozenTrial, TrialState
@@ -30,12 +31,15 @@ from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     SPEED,
+    Configuration,
     InstanceFailedError,
     Outcomes,
     combined_objective,
     compare,
     hold_last_pose_protocol,
     improvement_bound,
+    lost_scenes,
+    scene_errors_m,
 )
 from dynslam_bench.tuning.plan import (
     Design,
@@ -61,6 +65,24 @@ OFFERED = (Verdict.PROVEN, Verdict.BUT_LOST, Verdict.PROMISING)
 """Verdicts with which `best.toml` sets the best trial's settings; with others it keeps the baseline's."""
 
 
+class SceneErrors(Record):
+    """ATE of the baseline and of a candidate in one scene, lost frames held, see `scene_errors_m`.
+
+    Attributes:
+        scene: The scene.
+        baseline_m: ATE of the baseline, metres.
+        candidate_m: ATE of the candidate, metres.
+        lost_by_baseline: Whether the baseline lost at least half of its runs there.
+        lost: Whether the candidate did.
+    """
+
+    scene: str
+    baseline_m: float
+    candidate_m: float
+    lost_by_baseline: bool = False
+    lost: bool = False
+
+
 class Candidate(Record):
     """One of the best configurations, judged again.
 
@@ -70,13 +92,16 @@ class Candidate(Record):
         values: What its trial had been worth.
         choice: Mean log ratio on the instances of the choice, which ranks the candidates; None
             without such instances.
-        confirm: Beside the baseline on the instances of the choice; where nothing is held out they
-            judge.
-        held_out: On the held-out instances; None without any, or if it is not the best.
+        confirm: Comparison with the baseline on the instances of the choice; where nothing is held
+            out they judge.
+        held_out: Comparison with the baseline on the held-out instances; None without any, or if it
+            is not the best.
         recorded: ATE on recordings, which is said and decides nothing; None without any, or if it is not the best.
-        beyond: By the means of the judging families that no trial saw; None for fewer than `FEWEST` of them.
+        scene_errors: Its ATE and the baseline's in each scene that judges; empty where none judged.
+        beyond: Comparison by the means of the judging families that no trial saw; None for fewer
+            than `FEWEST` of them.
         on_confirm: ATE and processor time on the instances of the choice, by objective.
-        on_held_out: The same on the held-out instances.
+        on_held_out: ATE and processor time on the held-out instances, by objective.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
             errors.
         feasible: Whether the constraints hold in the new runs.
@@ -92,6 +117,7 @@ class Candidate(Record):
     confirm: PairedRatio | None = None
     held_out: PairedRatio | None = None
     recorded: PairedRatio | None = None
+    scene_errors: list[SceneErrors] = Field(default_factory=list)
     beyond: PairedRatio | None = None
     on_confirm: dict[str, PairedRatio] = Field(default_factory=dict)
     on_held_out: dict[str, PairedRatio] = Field(default_factory=dict)
@@ -105,6 +131,20 @@ class Candidate(Record):
     def evidence(self) -> PairedRatio | None:
         """Its ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
         return self.confirm if self.held_out is None else self.held_out
+
+    @property
+    def errors_sentence(self) -> str:
+        """The errors of the baseline and of this candidate over the judging scenes in millimetres; or empty."""
+        if not self.scene_errors:
+            return ""
+        # geometric means, whose quotient is the mean ratio of the scenes
+        baseline_mm = 1000 * geometric_mean(scene.baseline_m for scene in self.scene_errors)
+        candidate_mm = 1000 * geometric_mean(scene.candidate_m for scene in self.scene_errors)
+        count = len(self.scene_errors)
+        return (
+            f"Geometric mean of the ATE over {count} {'scene' if count == 1 else 'scenes'}: baseline "
+            f"{baseline_mm:#.3g} mm, trial {self.trial} {candidate_mm:#.3g} mm."
+        )
 
     @property
     def as_accurate(self) -> bool:
@@ -121,7 +161,7 @@ class Candidate(Record):
 
 
 class StudySummary(Record):
-    """What came out of a study; `summary.json` in its folder.
+    """Result of a study; `summary.json` in its folder.
 
     Attributes:
         name: The study.
@@ -136,8 +176,8 @@ class StudySummary(Record):
             ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
         tune: The instances that trials ran on.
-        confirm: Those of the choice; where nothing is held out they judged it.
-        held_out: Those that judged it.
+        confirm: The instances of the choice; where nothing is held out they judged it.
+        held_out: The held-out instances, which judged it.
         recorded: Recordings that the best one was run on at the end.
         seen: Splits with scenes that the network behind the masks was trained on, see
             `plan.seen_note`.
@@ -315,14 +355,11 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     if needed > _TOO_MANY:
         return [f"More than {_TOO_MANY} scenes would be needed to settle it"]
     # an extendable study goes on to its next look
-    further = [count for count in LOOKS if count > evidence.all_scenes]
-    if spec.extendable and further and needed <= max(LOOKS):
-        step = further[0] - evidence.all_scenes
+    if step := _further_scenes(spec, best):
         minutes = max(1, math.ceil(step * best.scene_s / 60))
-        command = f"dynslam-bench tune extend STUDY.toml --scenes {step}"
         return [
             f"About {needed} scenes would settle it",
-            f"The next look takes {minutes} min of runs: {command}",
+            f"The next look takes {minutes} min of runs: {_extend_command(step)}",
         ]
     minutes = max(1, math.ceil(needed * best.scene_s / 60))
     return [
@@ -330,8 +367,64 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     ]
 
 
+def _further_scenes(spec: StudySpec, best: Candidate) -> int:
+    """How many scenes the next look of an extendable study adds; 0 where no look would settle it."""
+    evidence = best.evidence
+    needed = None if evidence is None else scenes_to_settle(evidence)
+    if evidence is None or needed is None or needed > max(LOOKS) or not spec.extendable:
+        return 0
+    further = [count for count in LOOKS if count > evidence.all_scenes]
+    return further[0] - evidence.all_scenes if further else 0
+
+
+def _extend_command(scenes_more: int) -> str:
+    """The command that judges on further scenes."""
+    return f"dynslam-bench tune extend STUDY.toml --scenes {scenes_more}"
+
+
+def next_step(
+    spec: StudySpec, summary: StudySummary, baseline: Configuration, best: Configuration
+) -> tuple[str, str]:
+    """What to do after a study: a sentence, and the command that does it.
+
+    Args:
+        spec: The study.
+        summary: What came out of it.
+        baseline: What ratios are to.
+        best: The best trial's tracker and settings; the baseline's where there is none.
+    """
+    # paths are those in the study's folder
+    run_best = f"dynslam-bench run {shlex.quote(best.tracker)} SEQUENCE --settings best.toml"
+    candidate = summary.best
+    if summary.keeps_default:
+        command = f"dynslam-bench run {shlex.quote(spec.tracker)} SEQUENCE"
+        return "Keep the default settings: they are as good as the best trial.", command
+    if summary.is_to_use and candidate is not None:
+        return f"Use the settings of trial {candidate.trial}.", run_best
+
+    evidence = None if candidate is None else candidate.evidence
+    if summary.verdict is Verdict.BUT_LOST and candidate is not None and evidence is not None:
+        scene = shlex.quote(evidence.losses[0]) if evidence.losses else "SEQUENCE"
+        return (
+            f"See where trial {candidate.trial} fails before you use it.",
+            f"dynslam-bench run {shlex.quote(best.tracker)} {scene} --settings best.toml --snapshots",
+        )
+    if summary.verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL):
+        is_usable = candidate is not None and not candidate.failed and candidate.feasible
+        step = _further_scenes(spec, candidate) if candidate is not None and is_usable else 0
+        if step:
+            return "Keep the baseline for now, and judge on more scenes.", _extend_command(step)
+        return (
+            "Keep the baseline for now. To learn more, name more held_out scenes in a new study.",
+            "dynslam-bench tune run NEW_STUDY.toml",
+        )
+    preset = f" --settings {shlex.quote(spec.baseline)}" if spec.baseline.endswith(".toml") else ""
+    command = f"dynslam-bench run {shlex.quote(baseline.tracker)} SEQUENCE{preset}"
+    return "Keep the baseline.", command
+
+
 def families_sentence(design: Design) -> str:
-    """On which families a study judges, and whether its trials saw other scenes of them."""
+    """A sentence on the families that a study judges on, and on whether its trials saw other scenes of them."""
     judging = _families(design.judging)
     tuned = _tuned_families(design)
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
@@ -354,9 +447,9 @@ def beyond_families(
     more is lost by it.
 
     Args:
-        comparison: Over scenes.
-        ratios: Log ratio by scene.
-        design: Of the study.
+        comparison: The comparison over all judging scenes.
+        ratios: Natural log of the error ratio by scene.
+        design: The study's design: which instances it runs on, and what for.
 
     Returns:
         None for fewer than `FEWEST` such families.
@@ -595,7 +688,7 @@ def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
 
 
 def _rank_by_choice(candidate: Candidate) -> tuple[bool, bool, float]:
-    """Those that ran and fulfil the constraints first, then by their value on the instances of the choice."""
+    """Sort key: candidates that ran and fulfil the constraints first, then by value on the instances of the choice."""
     value = math.inf if candidate.choice is None else candidate.choice
     return bool(candidate.failed), not candidate.feasible, value
 
@@ -620,7 +713,7 @@ def _run_again(
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
     tuned = [tuner.configuration(candidate.params) for candidate in candidates]
-    default = [] if tuner.shipped is None else [tuner.shipped]
+    default = [] if tuner.default_configuration is None else [tuner.default_configuration]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
         shipped[split] = compare(outcomes, baseline, objective=objective, one_sided=level)
@@ -656,6 +749,7 @@ def _judged_on(
     if tuner.design.judging == getattr(tuner.design, split):
         ratios = objective.ratios(outcomes, baseline)
         update["beyond"] = beyond_families(update[split], ratios, tuner.design)
+        update["scene_errors"] = _scene_errors(outcomes, baseline)
     if split == "confirm":
         update["choice"] = objective.value(outcomes, baseline)
     both = (*outcomes.values(), *baseline.values())
@@ -663,6 +757,25 @@ def _judged_on(
     wall_s = sum(run.wall_s for run in both)
     update["scene_s"] = wall_s / len(scenes(outcomes))
     return candidate.model_copy(update=update)
+
+
+def _scene_errors(outcomes: Outcomes, baseline: Outcomes) -> list[SceneErrors]:
+    """The errors of a candidate beside the baseline's, scene by scene."""
+    errors_m = scene_errors_m(outcomes)
+    baseline_m = scene_errors_m(baseline)
+    lost = lost_scenes(outcomes)
+    lost_by_baseline = lost_scenes(baseline)
+    return [
+        SceneErrors(
+            scene=scene,
+            baseline_m=baseline_m[scene],
+            candidate_m=error_m,
+            lost_by_baseline=scene in lost_by_baseline,
+            lost=scene in lost,
+        )
+        for scene, error_m in errors_m.items()
+        if scene in baseline_m
+    ]
 
 
 def _write(tuner: Study, summary: StudySummary) -> None:

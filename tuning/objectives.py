@@ -36,7 +36,7 @@ class Outcome:
     """One configuration on one instance.
 
     Attributes:
-        instance: Where.
+        instance: The instance that was run.
         run_id: The run.
         ate_m: ATE RMSE in metres, lost frames held at the last pose.
         coverage: Share of frames that were tracked.
@@ -80,7 +80,7 @@ class Configuration(NamedTuple):
     settings: Mapping[str, Any]
 
 
-FOREIGN = "transfer"
+EXTERNAL_STAGE = "transfer"
 """Stage that only trackers in another program have."""
 
 
@@ -124,7 +124,7 @@ def outcome(
 
     # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
-    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
+    elsewhere = record.device.startswith("cuda") or EXTERNAL_STAGE in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
     period_s = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     return Outcome(
@@ -225,7 +225,7 @@ _MANY = 1e9
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
 _CALLS_FLOOR = 0.01
-"""The same for the frames on which a network ran."""
+"""The share that is added on both sides to the frames on which a network ran, for the same reason."""
 STAGE = "time:"
 """Begins the name of an objective or a limit on a stage's time, e.g. ``time:tracking``."""
 
@@ -317,7 +317,7 @@ class Objective:
         return centre(counted.values())
 
     def counted(self, ratios: Mapping[str, float]) -> dict[str, float]:
-        """Those scenes' ratios that the value is the mean of: all, or the worst ones."""
+        """The scenes' ratios that the value is the mean of: all, or the worst ones."""
         if not self.worst:
             return dict(ratios)
         ranked = sorted(ratios.items(), key=lambda scene: scene[1], reverse=True)
@@ -486,7 +486,7 @@ def violations(
         spec: The study. One of anything but error alone must not pay for its gain with accuracy:
             the ATE ratio has to stay below 1 + `StudySpec.ate_margin`; a front of several
             objectives holds the error itself.
-        outcomes: Of a configuration.
+        outcomes: Outcomes of the configuration, by instance.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
         constraints: A user's own by name: the mean of each over the instances has to be <= 0.
     """
@@ -516,7 +516,7 @@ Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 
 
-def place_of(instance: ProblemInstance) -> ProblemInstance:
+def instance_without_repeat(instance: ProblemInstance) -> ProblemInstance:
     """The instance without its start and seed: all runs there are repeats of each other."""
     return replace(instance, offset=0, seed=0)
 
@@ -528,8 +528,9 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
     the baseline's, so that no single start decides; a scene is the mean of its places.
 
     Args:
-        errors: Of the configuration.
-        baseline: At every place of `errors`; more starts make it steadier.
+        errors: Errors of the configuration in metres, by instance.
+        baseline: Errors of the baseline, by instance, at every place of `errors`; more starts make
+            it steadier.
 
     Returns:
         Natural logarithm by scene, below 0 is better than the baseline.
@@ -548,10 +549,23 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
 
 def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     """Natural logarithms of the errors in metres, by place."""
-    groups = grouped(errors, place_of).items()
+    groups = grouped(errors, instance_without_repeat).items()
     return {
         place: [math.log(max(errors[instance], FLOOR_M)) for instance in group]
         for place, group in groups
+    }
+
+
+def scene_errors_m(outcomes: Outcomes) -> dict[str, float]:
+    """ATE in metres in each scene: the median over the starts at each place, the geometric mean over its places.
+
+    The quotient of two configurations that ran from the same starts is their ratio by `by_scene`.
+    """
+    errors = {instance: run.ate_m for instance, run in outcomes.items()}
+    medians = {place: float(np.median(logs)) for place, logs in log_errors(errors).items()}
+    return {
+        scene: math.exp(fmean(medians[place] for place in places))
+        for scene, places in scenes(medians).items()
     }
 
 
@@ -581,8 +595,8 @@ def compare(
     A scene has one log ratio, of the medians over its repeats (start offsets and seeds), or it is lost.
 
     Args:
-        outcomes: Of the configuration.
-        baseline: Of the baseline.
+        outcomes: Outcomes of the configuration, by instance.
+        baseline: Outcomes of the baseline, by instance.
         objective: What is compared.
         one_sided: Level of a claim, e.g. 0.025.
 

@@ -1,7 +1,7 @@
-"""The page of a study: verdict, what was tried, confirmed and held out, settings, Optuna's plots, all trials."""
+"""The page of a study: verdict, what to do, errors in millimetres, what was tried and judged, settings, all trials."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from dynslam_bench.core import read_text, setting_text, write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.evaluation.verdicts import PairedRatio, Verdict
 from dynslam_bench.reports.build_report import sections_page
-from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL
+from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL, log_axis, mm_axis, rounded, safe
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
+from dynslam_bench.reports.model.names import shortened
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import (
     Column,
@@ -23,10 +24,17 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     csv_text,
+    mm,
     number,
     numbers,
 )
-from dynslam_bench.tuning.judgement import Candidate, StudySummary, preset_text
+from dynslam_bench.tuning.judgement import (
+    Candidate,
+    SceneErrors,
+    StudySummary,
+    next_step,
+    preset_text,
+)
 from dynslam_bench.tuning.plan import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, front_trials, is_feasible, quiet
 from dynslam_bench.tuning.study import Study
@@ -67,7 +75,10 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         "on scenes that no trial had seen; and of the best one on the held-out scenes and recordings. Bars: intervals "
         "over scenes (Hodges and Lehmann). The star is what is proven."
     )
+    sentence, command = next_step(spec, summary, tuner.baseline, tuner.configuration(params))
     sections = [
+        Section("next", "Do this", [], [Block(text=command, caption=sentence)]),
+        _scenes_section(tuner, summary),
         Section(
             "result",
             "Tried, chosen, judged",
@@ -87,8 +98,8 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     ]
 
     if len(tuner.objectives) > 1:
-        sections.insert(1, _front(tuner))
-    command = command_line(tuner.study.user_attrs.get("command", []))
+        sections.insert(2, _front(tuner))
+    started_with = command_line(tuner.study.user_attrs.get("command", []))
     made_with = (
         f"Sampler {tuner.sampler_name}, pruner {tuner.pruner_name}, Optuna {optuna.__version__}."
     )
@@ -100,7 +111,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         protocol=f"{_asked(tuner, summary)} {summary.protocol}.",
         evaluates=True,
         links=[],
-        footer=f"{made_with} Reproduce: {command}",
+        footer=f"{made_with} Reproduce: {started_with}",
     )
     write_assets(tuner.folder)
     write_atomic(tuner.folder / "index.html", html)
@@ -108,7 +119,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
 
 
 def _asked(tuner: Study, summary: StudySummary) -> str:
-    """What the study was asked, in words."""
+    """The question of the study, in words."""
     goals = " and ".join(objective.what for objective in tuner.objectives)
     trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
     design = tuner.design
@@ -178,6 +189,8 @@ def _optuna_figures(tuner: Study, params: list[str], has_importances: bool) -> d
                 tuner.study, params=params[:_CONTOURS], **target
             ),
         }
+        for name in ("History", "Slices"):
+            figures[name].add_hline(1.0, **GUIDE)
         if has_importances:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             figures["Importances"] = visualization.plot_param_importances(
@@ -199,14 +212,11 @@ def _optuna_figures(tuner: Study, params: list[str], has_importances: bool) -> d
 
 
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
-    """The best settings with their status, and how to use them only if they are proven."""
+    """The best settings beside the baseline's, and the preset with its status."""
     shown = Block(table=settings)
     text = read_text(tuner.folder / "best.toml")
     if summary.is_to_use:
-        params = summary.best.params if summary.best else {}
-        tracker = tuner.configuration(params).tracker
-        command = f"dynslam-bench run '{tracker}' SEQUENCE --settings best.toml"
-        return [shown, Block(text=text), Block(title="Use them", text=command)]
+        return [shown, Block("best.toml", text=text)]
     why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
     return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]
 
@@ -257,10 +267,108 @@ def _importance_note(summary: StudySummary) -> str:
     return f"Importances (PED-ANOVA) and their 95 % intervals: {shares}. They add up to 100 % even where none matters."
 
 
+def _scenes_section(tuner: Study, summary: StudySummary) -> Section:
+    """The errors of the baseline and of the best trial on every scene that judged, in millimetres."""
+    title = "Baseline and best trial on every scene"
+    best = summary.best
+    if best is None or not best.scene_errors:
+        return Section("scenes", title)
+
+    # the scenes where the candidate gains most first
+    ordered = sorted(best.scene_errors, key=lambda scene: scene.candidate_m / scene.baseline_m)
+    short = shortened([scene.scene for scene in ordered])
+    rows = []
+    for scene in ordered:
+        lost = [
+            who
+            for who, is_lost in (("baseline", scene.lost_by_baseline), ("trial", scene.lost))
+            if is_lost
+        ]
+        rows.append(
+            [
+                TableCell(scene.scene),
+                TableCell(mm(scene.baseline_m), value=scene.baseline_m),
+                TableCell(mm(scene.candidate_m), value=scene.candidate_m),
+                number(scene.candidate_m / scene.baseline_m, ".3f"),
+                TableCell(" and ".join(lost)),
+            ]
+        )
+    columns = [
+        Column("scene", numeric=False),
+        Column("baseline", "ATE, mm", full="baseline_m"),
+        Column(f"trial {best.trial}", "ATE, mm", full="trial_m"),
+        Column("ratio", meaning="below 1 the trial is better"),
+        Column("lost by", numeric=False),
+    ]
+    words = "ATE in millimetres, lost frames held: median of a scene's starts."
+    table = Table("scenes", "The same as a table", words, columns, rows)
+    write_atomic(tuner.folder / "csv" / "scenes.csv", csv_text(table.frame()))
+    caption = f"{best.errors_sentence} Crosses: lost track in half of the runs or more. {words}"
+    figure = _scenes_figure(ordered, short, best.trial)
+    return Section(
+        "scenes",
+        title,
+        [],
+        [*figure_blocks(figure, caption), Block(table.title, table, folded=True)],
+    )
+
+
+def _scenes_figure(
+    ordered: Sequence[SceneErrors], short: Mapping[str, str], trial: int
+) -> go.Figure:
+    """A line a scene from the baseline's error to the trial's, on a logarithmic axis in millimetres."""
+    names = [safe(short[scene.scene]) for scene in ordered]
+    baseline_mm = [1000 * scene.baseline_m for scene in ordered]
+    trial_mm = [1000 * scene.candidate_m for scene in ordered]
+
+    # the lines that join them: a gap behind each
+    joined_x: list[float | None] = []
+    joined_y: list[str | None] = []
+    for name, one, other in zip(names, baseline_mm, trial_mm, strict=True):
+        joined_x += [one, other, None]
+        joined_y += [name, name, None]
+    line = {"color": NEUTRAL, "width": 2}
+    traces = [
+        go.Scatter(
+            x=joined_x, y=joined_y, mode="lines", line=line, hoverinfo="skip", showlegend=False
+        )
+    ]
+
+    # the two errors
+    sides = (
+        ("baseline", baseline_mm, [scene.lost_by_baseline for scene in ordered], NEUTRAL),
+        (f"trial {trial}", trial_mm, [scene.lost for scene in ordered], COLOURS[0]),
+    )
+    for who, errors_mm, lost, colour in sides:
+        traces.append(
+            go.Scatter(
+                x=rounded(errors_mm),
+                y=names,
+                mode="markers",
+                name=who,
+                marker={
+                    "color": colour,
+                    "size": 11,
+                    "symbol": ["x" if each else "circle" for each in lost],
+                },
+                hovertemplate="%{y}<br>%{x:.3g} mm<extra>%{fullData.name}</extra>",
+            )
+        )
+    layout = {
+        "template": {},
+        "height": 130 + 22 * len(names),
+        "xaxis": mm_axis("absolute trajectory error (mm), left is better"),
+        "yaxis": {"categoryorder": "array", "categoryarray": names[::-1]},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"},
+    }
+    return go.Figure(traces, go.Layout(**layout))
+
+
 def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged."""
-    # the trials, spread over the width of their stage so that they do not hide each other
-    tried = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    # the trials with other settings, spread over the width of their stage so that they do not hide each other
+    finished = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    tried = [trial for trial in finished if trial.number > 0]
     spread = 0.5 * (np.random.default_rng(0).random(len(tried)) - 0.5)
     stages = [f"tried: {len(tried)} whole trials"]
     traces = [
@@ -293,8 +401,20 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
         "range": [-0.5, len(stages) - 0.5],
     }
     layout = {"height": 420, "template": {}, "showlegend": False, "xaxis": axis}
-    figure = go.Figure(traces, go.Layout(yaxis={"title": "ratio to the baseline"}, **layout))
+    figure = go.Figure(traces, go.Layout(yaxis=log_axis("ratio to the baseline"), **layout))
     figure.add_hline(1.0, **GUIDE)
+    # annotations on a logarithmic axis take the logarithm of their place
+    figure.add_annotation(
+        x=0.0,
+        xref="paper",
+        xanchor="left",
+        y=math.log10(1.0),
+        yanchor="bottom",
+        text="baseline",
+        showarrow=False,
+    )
+    # an invisible point on the line: axes are fitted to points, not to lines
+    figure.add_trace(go.Scatter(x=[0], y=[1.0], mode="markers", opacity=0, hoverinfo="skip"))
     return figure
 
 

@@ -45,7 +45,7 @@ from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.families import same_path
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
-from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.sequences.view import SequencePart, sequence_part_of
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.objectives import (
     Configuration,
@@ -54,9 +54,9 @@ from dynslam_bench.tuning.objectives import (
     Outcomes,
     find_objective,
     hold_last_pose_protocol,
+    instance_without_repeat,
     log_errors,
     outcome,
-    place_of,
     quantity,
     violations,
 )
@@ -87,7 +87,7 @@ def _trackers(spec: StudySpec) -> list[str]:
 
 
 def known_settings(tracker: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the values that a tracker has settings for."""
+    """The values that a tracker has settings for."""
     names = set(field_names(TRACKERS.get(tracker).settings))
     return {name: value for name, value in values.items() if name in names}
 
@@ -117,7 +117,7 @@ FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion
 
 
 class Preview(Record):
-    """What a study could show, before it runs.
+    """Preview of a study before it runs: the differences that it could show, and its time.
 
     Attributes:
         scenes: Scenes that judge it: held-out ones, or those of `confirm`.
@@ -128,7 +128,7 @@ class Preview(Record):
         power: Chance of *proven* for a candidate with `GAIN` less error.
         detectable: Smallest gain, as a share, that is proven in four of five studies.
         needed: Scenes that prove `GAIN` in four of five.
-        minutes: Of the whole study if no trial is pruned.
+        minutes: Estimated minutes of the whole study if no trial is pruned.
         unused: Settings of the space that belong to a part whose verdicts are not used on these
             scenes, and why.
         include: The space without them, as a study names it; empty where nothing is unused.
@@ -170,9 +170,11 @@ class Preview(Record):
                 f"A design that proves {100 * GAIN:.0f} % in four of five has {self.needed} held-out scenes with one "
                 f"start each (offsets = [0]); clips of 40 frames show as much as longer ones."
             )
-        lines.append(
-            f"The study takes about {max(1, math.ceil(self.minutes))} min if no trial is pruned."
-        )
+        basis = ""
+        if not self.runs:
+            basis = f", at {1000 * FRAME_S:.0f} ms a frame: no run of the baseline is stored that tells more"
+        minutes = max(1, math.ceil(self.minutes))
+        lines.append(f"The study takes about {minutes} min if no trial is pruned{basis}.")
         return lines
 
     @property
@@ -190,7 +192,9 @@ class Preview(Record):
 
 
 class Plan:
-    """What follows from a study alone; nothing runs, and nothing is stored.
+    """A study resolved before it runs: trackers, baseline, search space, instances.
+
+    Nothing runs, and nothing is stored.
 
     Args:
         spec: The study.
@@ -202,13 +206,13 @@ class Plan:
     Attributes:
         held: See `held_settings`.
         baseline: What ratios are to.
-        shipped: The tracker's default settings, where the baseline is something else.
+        default_configuration: The tracker's default settings, where the baseline is something else.
         defaults: The settings of trial 0.
-        base: The same by dotted name, and the settings of other trackers to choose from.
+        base: Settings of trial 0 by dotted name, with those of the other trackers to choose from.
         trackers: The trackers to choose from, the study's own first.
         search: The space.
         space: What is tuned, as its parameters.
-        design: On which instances.
+        design: Instances that the study runs on, by what they are for.
 
     Raises:
         DynslamError: Anything in the spec is unknown, unfit or missing.
@@ -237,30 +241,34 @@ class Plan:
         self.held = held_settings(spec)
         self.trackers = _trackers(spec)
         protocol = hold_last_pose_protocol(spec.protocol)
-        around: dict[str, Settings] = {}
+        settings_by_tracker: dict[str, Settings] = {}
         for tracker in self.trackers:
-            described = TRACKERS.get(tracker)
-            protocol.check_scale(tracker, described.sensors)
+            tracker_spec = TRACKERS.get(tracker)
+            protocol.check_scale(tracker, tracker_spec.sensors)
             held = self.configuration({TRACKER: tracker}).settings
-            around[tracker] = apply_overrides(described.settings(), held)
+            settings_by_tracker[tracker] = apply_overrides(tracker_spec.settings(), held)
 
         # the baseline: the study's tracker with a preset or its defaults, or another tracker, which
         # has no settings but those of the fixed ones that it knows
         self.baseline = self.configuration({})
         if spec.baseline and not spec.baseline.endswith(".toml"):
             self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
-        self.shipped = None
+        self.default_configuration = None
         if spec.baseline:
             defaults = fixed if len(self.trackers) == 1 else known_settings(spec.tracker, fixed)
-            self.shipped = Configuration(spec.tracker, defaults)
+            self.default_configuration = Configuration(spec.tracker, defaults)
 
-        # the space around trial 0, which has to lie in it, and the instances
-        self.defaults = around[spec.tracker]
+        # the space around trial 0, and the instances; in `resolved_by_tracker` a source stands for ``auto``
+        self.defaults = settings_by_tracker[spec.tracker]
         sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-        shown = {tracker: _with_source(settings, sequences) for tracker, settings in around.items()}
-        self.search = build_space(spec.space, around, shown)
+        resolved_by_tracker = {
+            tracker: _with_source(settings, sequences)
+            for tracker, settings in settings_by_tracker.items()
+        }
+        self.search = build_space(spec.space, settings_by_tracker, resolved_by_tracker)
         self.space = list(self.search.parameters)
         self.base = self.search.base | flatten(self.defaults)
+        # refuse a study whose trial 0 lies outside its space
         starting_point({}, self.search, what="the baseline")
         self.design = design_of(spec)
 
@@ -313,7 +321,7 @@ class Plan:
         return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
-        """What a configuration of the space runs with: its tracker, and those settings that it has."""
+        """Tracker and settings that a configuration of the space runs with."""
         settings = {**self.held, **params}
         tracker = str(settings.pop(TRACKER, self.spec.tracker))
         if len(self.trackers) > 1:
@@ -351,7 +359,7 @@ class Plan:
             StudyError: It names what has changed.
         """
         run = resolve(self.run_spec(self.design.tune[0], self.baseline))
-        changed = LookUp(self.store).changed(run) if run.foreign else ""
+        changed = LookUp(self.store).changed(run) if run.has_plugins_or_programs else ""
         if changed:
             raise StudyError(
                 f"study '{self.spec.name}': {changed} has changed since the baseline ran",
@@ -432,7 +440,7 @@ class Design:
 
     @property
     def judging(self) -> tuple[ProblemInstance, ...]:
-        """What judges: the held-out instances, or else `confirm`."""
+        """Instances that judge: the held-out ones, or else `confirm`."""
         return self.held_out or self.confirm
 
 
@@ -508,7 +516,7 @@ def running_order(instances: Sequence[ProblemInstance], seed: int) -> list[Probl
 def with_more_starts(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
     """The instances, and more starts of each place that has fewer than `FEWEST_STARTS`."""
     more = list(instances)
-    for repeats in grouped(instances, place_of).values():
+    for repeats in grouped(instances, instance_without_repeat).values():
         used = {instance.offset for instance in repeats}
         unused = (offset for offset in itertools.count() if offset not in used)
         added = islice(unused, max(FEWEST_STARTS - len(used), 0))
@@ -549,7 +557,7 @@ def check_splits(
     the catalogue, or its scene, gives to one split must not stand in the other.
 
     Args:
-        name: Of the study.
+        name: Name of the study.
         splits: Its instances: to tune on, to judge the survivors on, and held out.
         data_root: Folder of the recorded sequences.
 
@@ -571,7 +579,7 @@ def check_splits(
         _check_repeats(instances, opened, apart=set(splits.get("confirm", ())))
 
     # content: no sequence of one split may be one of the other
-    scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
+    scenes_of = {name: sequence_part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
@@ -592,7 +600,7 @@ def _check_copies(study: str, names: Iterable[str], opened: Mapping[str, Any]) -
     """Refuse one recording under several names within a split: it would count as several scenes."""
     recorded = [name for name in names if not hasattr(opened[name], "scene_digest")]
     for one, other in combinations(recorded, 2):
-        if part_of(opened[one]).scene == part_of(opened[other]).scene:
+        if sequence_part_of(opened[one]).scene == sequence_part_of(opened[other]).scene:
             continue
         if same_recording(opened[one], opened[other]):
             raise StudyError(
@@ -607,19 +615,19 @@ def _check_repeats(
     """Refuse instances of one scene that share frames and are no repeats of each other.
 
     Args:
-        instances: Of the splits that may share a recording.
-        opened: Their sequences by name.
-        apart: Those of them that may share no frame with the others, whether repeats or not.
+        instances: Instances of the splits that may share a recording.
+        opened: Sequences of the instances, by name.
+        apart: Instances that may share no frame with the others, whether they are repeats or not.
 
     Raises:
         StudyError: Two share frames, or an instance is named twice.
     """
-    parts: dict[ProblemInstance, Part] = {}
+    parts: dict[ProblemInstance, SequencePart] = {}
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
         cut = cast("Any", instance.cut(opened[instance.sequence]))
-        parts[instance] = part_of(cut, instance.offset)
+        parts[instance] = sequence_part_of(cut, instance.offset)
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue
@@ -627,7 +635,7 @@ def _check_repeats(
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
         same_frames = (here.start, here.stop) == (there.start, there.stop)
-        repeats = place_of(one) == place_of(other) or same_frames
+        repeats = instance_without_repeat(one) == instance_without_repeat(other) or same_frames
         if shared > 0 and not (repeats and (one in apart) == (other in apart)):
             raise StudyError(
                 f"'{one}' and '{other}' share {shared} frames",
@@ -635,8 +643,8 @@ def _check_repeats(
             )
 
 
-def _images(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
-    """What decides the images that a tracker sees, and the numbers that it draws, within a scene."""
+def _images(instance: ProblemInstance, part: SequencePart) -> tuple[object, ...]:
+    """Key of the images that a tracker sees, and of the random numbers that it draws, within a scene."""
     return part.block, part.noise, instance.offset, instance.degradation, instance.seed
 
 
@@ -740,7 +748,7 @@ def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
     """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
 
     Args:
-        settings: Of the system.
+        settings: Settings of the system.
         sequences: What it runs on.
 
     Returns:

@@ -80,7 +80,7 @@ class SearchSpace:
         return values
 
     def effective(self, values: Mapping[str, Scalar]) -> dict[str, Scalar]:
-        """Those of a configuration's values that have an effect."""
+        """The values of a configuration that have an effect."""
         return {name: value for name, value in values.items() if not self.why_not(name, values)}
 
     def why_not(self, name: str, values: Mapping[str, Any]) -> str:
@@ -158,10 +158,10 @@ def build_space(
 
     Args:
         spec: Which settings are tuned, in which ranges, and when.
-        settings: Of each tracker by its name, the baseline's and the fixed values among them; the
-            study's own tracker first.
-        shown: The same where a setting stands for another, e.g. a source of masks for ``auto``;
-            they decide what has an effect.
+        settings: Settings of each tracker by the tracker's name, with the baseline's and the fixed
+            values filled in; the study's own tracker first.
+        shown: Settings of each tracker where a setting that stands for another is replaced by it,
+            e.g. ``auto`` by a source of masks; they decide what has an effect.
 
     Raises:
         StudyError: A pattern or a name matches nothing, a range or a choice is refused by the

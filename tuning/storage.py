@@ -1,4 +1,8 @@
-"""Where a study is stored, a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials."""
+"""Where a study is stored: a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials.
+
+From the top: the best trials and the Pareto front; the trials as a pandas frame; importances of the
+settings; opening a storage; which workers of a study are alive; the journal file.
+"""
 
 import fcntl
 import json
@@ -95,19 +99,27 @@ def front_trials(study: optuna.Study) -> list[FrozenTrial]:
     """
     if len(study.directions) < 2:
         return []
-    own = optuna.create_study(directions=study.directions)
+    # the study's own feasible trials
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    candidates = [
+        trial for trial in complete if EARLIER not in trial.user_attrs and is_feasible(trial)
+    ]
+    if not candidates:
+        return []
+
+    # Optuna finds the front of a study, here one in memory of these trials alone
+    in_memory = optuna.create_study(directions=study.directions)
     with quiet():
-        own.add_trials(
-            trial
-            for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-            if EARLIER not in trial.user_attrs and is_feasible(trial)
-        )
-    values = {tuple(trial.values) for trial in own.best_trials} if own.trials else set()
+        in_memory.add_trials(candidates)
+    values_of_front = {tuple(trial.values) for trial in in_memory.best_trials}
+
+    # back to the study's trials, of those with equal values the first
     front: dict[tuple[float, ...], FrozenTrial] = {}
-    for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-        if tuple(trial.values) in values and is_feasible(trial) and EARLIER not in trial.user_attrs:
-            front.setdefault(tuple(trial.values), trial)
-    return [front[key] for key in sorted(front)]
+    for trial in candidates:
+        values = tuple(trial.values)
+        if values in values_of_front:
+            front.setdefault(values, trial)
+    return [front[values] for values in sorted(front)]
 
 
 def count_states(study: optuna.Study) -> dict[str, int]:
@@ -127,17 +139,34 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
     """All trials.
 
     Returns:
-        One row a trial, in order; what is missing is ``pd.NA``. ``Int64``: trial (0 is the
-        baseline's settings), runs (that it was evaluated on). ``string``: state (``complete``,
-        ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned or failed;
-        missing else), earlier (the study that it was taken from, and whether its code was another;
-        missing for the study's own). ``boolean``: feasible (all constraints hold; missing for
-        incomplete trials). ``Float64``: one column for each objective, named after ``value_``, as
-        Optuna has them (natural logarithms of ratios to the baseline, less is better), ratio (the
-        ATE ratio, below 1 is better than the baseline; missing if accuracy is no objective),
-        coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from the start of the
-        trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
-        ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
+        One row a trial, in order; what is missing is ``pd.NA``.
+
+        ``Int64`` columns:
+
+        - trial: 0 is the baseline's settings;
+        - runs: how many it was evaluated on.
+
+        ``string`` columns:
+
+        - state: ``complete``, ``pruned``, ``fail``, ``running``, ``waiting``;
+        - reason: why it was pruned or failed; missing else;
+        - earlier: the study that it was taken from, and whether its code was another; missing for
+          the study's own trials.
+
+        ``boolean`` column feasible: all constraints hold; missing for incomplete trials.
+
+        ``Float64`` columns:
+
+        - one for each objective, named after ``value_``, as Optuna has them: natural logarithms of
+          ratios to the baseline, less is better;
+        - ratio: the ATE ratio, below 1 is better than the baseline; missing if accuracy is no
+          objective;
+        - coverage: share, 0 to 1;
+        - fps: frames a second;
+        - duration_s: seconds from the start of the trial to its end.
+
+        Then a column ``params.NAME`` for each tuned setting, in its own unit: ``Float64``,
+        ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
     """
     trials = study.get_trials(deepcopy=False)
     numbers = [f"value_{objective}" for objective in spec.objectives]
@@ -207,7 +236,7 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
         Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where
         their values are equal.
     """
-    # trials of one objective: the mean of all
+    # copies of the trials with one objective, the mean log ratio over scenes and objectives
     trials = study.get_trials(deepcopy=False)
     copies = []
     for number, ratios in scene_ratios(study).items():
@@ -270,6 +299,7 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
         )
     folder = study_folder(results, spec)
     try:
+        # a journal file in the study's folder, an SQL database, or Optuna's proxy
         if not spec.storage:
             folder.mkdir(parents=True, exist_ok=True)
             return optuna.storages.JournalStorage(JournalFile(folder / "journal.log"))
@@ -379,10 +409,11 @@ _ALIVE = "alive "
 
 
 class Heartbeats:
-    """Which workers of a study live.
+    """Watches which workers of a study are alive.
 
-    One of this machine is dead once its process is, any other one once the number that it counts up
-    in the study's attributes has stood still for `GRACE_S` on this process' clock.
+    A worker of this machine is dead once its process is. A worker elsewhere is dead once its count
+    in the study's attributes, which `beat` raises, has stood still for `GRACE_S` on this process'
+    clock.
 
     Args:
         study: The study.
@@ -393,18 +424,27 @@ class Heartbeats:
         self._study = study
         self._count = 0
         self._seen: dict[str, tuple[int | None, float]] = {}
+        """The last count of each worker, and when it was first seen, seconds of the monotonic clock."""
 
     def is_dead(self, trial: FrozenTrial) -> bool:
-        """Whether the worker of a running trial has ended; of a trial that has not been given its name, all others."""
+        """Whether a running trial is abandoned: its worker has ended.
+
+        A worker may end before it writes its name to the trial. Such a trial is abandoned once it
+        has been nameless for `NAMELESS_S` and all other workers have ended.
+        """
         if worker := trial.user_attrs.get("worker"):
             return self._has_ended(worker)
-        alive = {
+        workers = {
             key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)
         }
-        others_ended = all(map(self._has_ended, alive - {self._name}))  # starts their clocks
-        return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
+        # look at every worker, which starts the clocks of all
+        have_ended = [self._has_ended(name) for name in workers - {self._name}]
+        is_nameless = self._seconds_unchanged(f"trial {trial.number}", None) > NAMELESS_S
+        return is_nameless and all(have_ended)
 
     def _has_ended(self, name: str) -> bool:
+        """Whether a worker, by the name that `worker_name` gave it, is dead."""
+        # a worker of this machine: look at its process, which must have started when the name says
         machine, _, process = name.rpartition(":")
         pid, _, start = process.partition(".")
         if machine == _machine() and pid.isdigit():
@@ -416,10 +456,10 @@ class Heartbeats:
             except psutil.NoSuchProcess:
                 return True
         # on another machine, or of an earlier version, which did not say when it started
-        return self._stands_still(name, self._study.user_attrs.get(_ALIVE + name)) > GRACE_S
+        return self._seconds_unchanged(name, self._study.user_attrs.get(_ALIVE + name)) > GRACE_S
 
-    def _stands_still(self, name: str, count: int | None) -> float:
-        """Seconds for which a count has been seen to stand still."""
+    def _seconds_unchanged(self, name: str, count: int | None) -> float:
+        """Seconds since a worker's count was first seen at its present value; 0 at the first look."""
         now = time.monotonic()
         if name not in self._seen or self._seen[name][0] != count:
             self._seen[name] = count, now
@@ -431,6 +471,7 @@ class Heartbeats:
         A worker elsewhere is silent if it does not count up while this waits, a little longer than
         `HEARTBEAT_S`.
         """
+        # the workers elsewhere, until one after the other counts up
         trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
         workers = {trial.number: trial.user_attrs.get("worker", "") for trial in trials}
         counts = self._study.user_attrs
@@ -443,6 +484,7 @@ class Heartbeats:
                 name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)
             }
 
+        # the state of each trial's worker
         states = {}
         for number, name in workers.items():
             if name in silent:

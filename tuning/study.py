@@ -107,7 +107,7 @@ class StudyEvent:
     Attributes:
         kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or
             ``finished`` (a trial).
-        number: Of the trial.
+        number: Number of the trial.
         total: How many there are to be.
         text: One line.
     """
@@ -125,7 +125,7 @@ OnRun = Callable[[RunEvent], None]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a trial came to.
+    """Outcome of a trial.
 
     Attributes:
         state: Complete, pruned or failed; waiting if it was interrupted, and is to be run again.
@@ -359,8 +359,8 @@ class Study(Plan):
 
         Args:
             settings: Overrides, dotted name to value.
-            instances: Where.
-            tracker: Whose; the study's if empty.
+            instances: Instances that are run.
+            tracker: Id of the tracker; the study's if empty.
             cache: Whether to use the stage cache, whose times are those of when its entries were
                 made; None for what the study says.
 
@@ -405,7 +405,7 @@ class Study(Plan):
 
         Args:
             configurations: What to run.
-            instances: Where.
+            instances: Instances that each is run on.
             jobs: Runs at a time.
             cache: Whether to use the stage cache, with which times cannot be compared.
             crash_is_loss: Whether a baseline that crashes has lost that instance, and no more.
@@ -466,7 +466,7 @@ class Study(Plan):
         return trials_frame(self.spec, self.study)
 
     def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
-        """What a trial runs with."""
+        """Tracker and settings that a trial runs with."""
         return self.configuration(trial.params)
 
     def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
@@ -810,7 +810,7 @@ class Study(Plan):
             )
 
     def _identify(self) -> dict[str, Any]:
-        """What must be the same when a study is resumed, by name.
+        """Identity of a study: everything that must be the same when it is resumed, by name.
 
         Beside the study's fields these are the baseline's settings, the content of its sequences,
         and the program that runs on them: code, weights, libraries, device.

@@ -47,7 +47,7 @@ _FORM = (
 
 @dataclass(frozen=True, order=True)
 class ProblemInstance:
-    """What a configuration is tried on: some frames of one sequence, from one start.
+    """Frames that a configuration is tried on: a part of one sequence, from one start.
 
     Attributes:
         sequence: Id or folder of the sequence.
@@ -86,7 +86,7 @@ class ProblemInstance:
 
     @property
     def scene(self) -> str:
-        """What is filmed, as far as the name tells: equal for all parts, lengths, starts and noises of a sequence."""
+        """Name of the filmed scene: equal for all parts, lengths, starts and noises of a sequence."""
         return scene_of(self.sequence)
 
     def run_spec(self, tracker: str, **how: Any) -> RunSpec:
@@ -142,7 +142,7 @@ def parse_instances(
     (``blur:0.5,glare:0.2``), ``stride`` a step between frames.
 
     Args:
-        text: Of a study's `tune`, `confirm` or `held_out`.
+        text: One entry of a study's `tune`, `confirm` or `held_out`.
         offsets: Start offsets where the text names none.
         seeds: Seeds where the text names none.
 
@@ -224,7 +224,7 @@ def further_scenes(
     """Further scenes of rendered sequences, one of each sequence in turn, each with the starts and seeds of its first.
 
     Args:
-        instances: Those to be continued.
+        instances: Instances whose sequences are to get further scenes.
         count: Scenes.
         taken: Scenes, as `scene_of` gives them, that are in use.
         numbers: Scene numbers to choose from.
@@ -313,7 +313,7 @@ def _numbers(text: str, whole: str) -> list[int]:
 
 def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     """``blur:0.5,glare:0.2`` as kinds and strengths in alphabetical order; an empty text holds none."""
-    from dynslam_bench.envs import Degradation
+    from dynslam_bench.envs.wrappers import Degradation
 
     kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
     strengths = {
@@ -476,7 +476,7 @@ class StudySpec(Record, frozen=True):
     """A tuning study.
 
     Attributes:
-        name: Of the study; names its folder ``studies/<name>`` under the results.
+        name: Name of the study and of its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
         baseline: What ratios are to: empty for the tracker's default settings, a preset (a TOML
             file), on which trials then build, or another tracker with its default settings.

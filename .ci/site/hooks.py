@@ -98,7 +98,7 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
-    """Likewise on the page that servers show for missing ones."""
+    """The page that servers show for missing ones searches by our own script, too."""
     return output_content.replace(SHIM, "/site/worker.js")
 
 

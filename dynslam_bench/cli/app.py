@@ -4,7 +4,6 @@ import errno
 import os
 import sys
 import warnings
-from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
@@ -131,7 +130,7 @@ def doctor(as_json: AsJson = False) -> None:
 @cache.command()
 def info(as_json: AsJson = False) -> None:
     """Show what the caches hold: stages, compiled kernels, rendered frames."""
-    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core.folders import find_data_root, kernel_files
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.sequences.synthetic.stored import renderings
 
@@ -141,7 +140,7 @@ def info(as_json: AsJson = False) -> None:
     rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
     total = sum(sizes.values())
 
-    kernels = [file.stat().st_size for file in _kernels()]
+    kernels = [file.stat().st_size for file in kernel_files()]
     stored = renderings(find_data_root())
     current = [rendering.size for rendering in stored if rendering.is_current]
     others = [rendering.size for rendering in stored if not rendering.is_current]
@@ -168,7 +167,7 @@ def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] 
     """Delete all stages and compiled kernels, and what other code or settings have rendered."""
     import shutil
 
-    from dynslam_bench.core.folders import find_data_root
+    from dynslam_bench.core.folders import find_data_root, kernel_files
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.sequences.synthetic.stored import renderings
 
@@ -178,20 +177,13 @@ def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] 
         what = f"all entries below {stage_cache.folder}, all compiled kernels"
         typer.confirm(f"delete {what}, and {len(others)} old renderings?", abort=True)
     freed = stage_cache.clear()
-    for kernel in _kernels():
+    for kernel in kernel_files():
         freed += kernel.stat().st_size
         kernel.unlink(missing_ok=True)
     for rendering in others:
         shutil.rmtree(rendering.folder, ignore_errors=True)
         freed += rendering.size
     write(f"freed {freed / 1e6:.1f} MB")
-
-
-def _kernels() -> list[Path]:
-    """The files of compiled kernels."""
-    from dynslam_bench.core.folders import kernels_folder
-
-    return sorted(kernels_folder().glob("*.kernel"))
 
 
 def start(arguments: list[str] | None = None) -> None:

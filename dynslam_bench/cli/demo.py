@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -16,10 +17,13 @@ from dynslam_bench.cli.output import SOME_RUNS_FAILED, note, progress, report_ta
 from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
 from dynslam_bench.core import find_data_root, write_atomic
+from dynslam_bench.core.folders import kernel_files
 from dynslam_bench.core.plugins import python_command
 
 if TYPE_CHECKING:
-    from dynslam_bench.reports import RunRow
+    from dynslam_bench.api import StudyResult
+    from dynslam_bench.reports import ReportPaths, RunRow
+    from dynslam_bench.runs import RunStore
     from dynslam_bench.tuning import StudySpec
 
 PROTOCOL = "tum-rgbd/v1"
@@ -43,6 +47,8 @@ MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
 COMPILED = "emfoa-oft?masks=none"
 """The tracker whose kernels are compiled ahead: it uses those of all others, too."""
+POLL_S = 0.5
+"""How often is looked whether all kernels are compiled."""
 KERNEL_FRAMES = 12
 """Frames in which every kernel is used once: keyframes, bundle adjustment, all phases of the flow."""
 
@@ -56,10 +62,7 @@ def demo(
     """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
     from functools import partial
 
-    from dynslam_bench.api import report, run_specs, tune
-    from dynslam_bench.evaluation import get_protocol
-    from dynslam_bench.reports import load_board
-    from dynslam_bench.reports.tables.leaderboard import per_sequence
+    from dynslam_bench.api import report, run_specs
     from dynslam_bench.runs import RunStore
     from dynslam_bench.suites import load_suite
 
@@ -88,36 +91,60 @@ def demo(
     note("making the report")
     paths = report(store.root, title="Demo: walking and sitting people, rendered")
 
-    # tune, on scenes of the study's own
+    tuned = tune_small_study(study, store.root / "study", jobs)
+    show_outcome(store, paths, tuned)
+    if any(run.record.failed for run in made):
+        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def tune_small_study(study: StudySpec, results: Path, jobs: int) -> StudyResult:
+    """Render the study's own scenes, and tune on them with a bar on standard error."""
+    from dynslam_bench.api import tune
+
     silence_optuna()
     instances = study.instances(*study.tune, *study.confirm, *study.held_out)
     render({instance.sequence for instance in instances})
     with progress(f"study {study.name}") as advance:
         bar = StudyBar(advance)
-        tuned = tune(
+        return tune(
             study,
-            results=store.root / "study",
+            results=results,
             jobs=jobs,
             on_event=bar.event,
             on_run=bar.run,
             on_note=note,
         )
 
-    # what came of it: the tables, and sentences on them
+
+def show_outcome(store: RunStore, paths: ReportPaths, tuned: StudyResult) -> None:
+    """Print the tables, sentences on them, and where the pages lie.
+
+    Args:
+        store: Where the runs are stored.
+        paths: The report.
+        tuned: The study.
+    """
+    from dynslam_bench.evaluation import get_protocol
+    from dynslam_bench.reports import load_board
+    from dynslam_bench.reports.tables.leaderboard import per_sequence
+
+    # the leaderboard, and every sequence
     board = load_board(store)
     protocol = get_protocol(PROTOCOL)
     for table in (paths.leaderboard, per_sequence(board, protocol)):
         write(f"\n{table.title}\n{report_table(table)}")
     write(f"\nProtocol: {protocol.describe()}\n")
+
+    # what they show, and what the study found
     conclusion = (
         f"The study, whose baseline does not grow its masks, on purpose: {tuned.summary.conclusion}"
     )
     for line in (*culling_effect(board.rows), conclusion):
         write(wrapped(line))
+
+    # where to look further
     write(f"\nreport: {paths.html}\nstudy:  {tuned.page}")
     write("next:   dynslam-bench run 'emfoa-oft?masks=none' FOLDER --camera tum-fr3")
-    if any(run.record.failed for run in made):
-        raise typer.Exit(SOME_RUNS_FAILED)
 
 
 def study_spec(frames: int, trials: int, baseline: Path) -> StudySpec:
@@ -187,7 +214,7 @@ def culling_effect(rows: Iterable[RunRow]) -> list[str]:
 
 def compile_kernels(tracker: str = COMPILED) -> None:
     """Use all kernels of rendering and a tracker once: then they lie compiled in the user's cache."""
-    from dynslam_bench.envs import SlamEnv
+    from dynslam_bench.envs.slam_env import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.testing import CornerSequence
 
@@ -207,8 +234,12 @@ def compiled_ahead() -> Iterator[None]:
     """
     command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        before = set(kernel_files())
         try:
             yield
-            process.wait()
+            with progress("compiling kernels, once") as advance:
+                while process.poll() is None:
+                    advance(len(set(kernel_files()) - before), None)
+                    time.sleep(POLL_S)
         finally:
             process.kill()

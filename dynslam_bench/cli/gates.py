@@ -181,7 +181,7 @@ def compare(
 
 @contextmanager
 def _progress() -> Iterator["OnRun"]:
-    """Which run is made, on standard error."""
+    """Show on standard error which run is made."""
     with progress("gate") as advance:
         made = 0
 

@@ -270,13 +270,13 @@ MemoryLimit = Annotated[
 ]
 
 
-def gather_settings(assignments: list[str] | None, file: Path | None = None) -> dict[str, Any]:
-    """Overrides by dotted name, of a file and of assignments; an assignment replaces the file's value.
+def gather_settings(set_options: list[str] | None, file: Path | None = None) -> dict[str, Any]:
+    """Overrides by dotted name, of a file and of ``--set`` options; an option replaces the file's value.
 
     Raises:
-        SettingsError: The file cannot be read, or an assignment is not of the form NAME=VALUE.
+        SettingsError: The file cannot be read, or an option is not of the form NAME=VALUE.
     """
     from dynslam_bench.core.settings import parse_assignments
 
     overrides = {} if file is None else read_settings(file)
-    return overrides | parse_assignments(assignments or ())
+    return overrides | parse_assignments(set_options or ())

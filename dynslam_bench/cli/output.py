@@ -15,7 +15,6 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import typer
-from pydantic_core import from_json, to_json
 
 from dynslam_bench.core import DynslamError, call_periodically, printable
 
@@ -31,6 +30,8 @@ HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
 _GAP = "  "
 """What separates the columns of a table."""
+_BAR_WIDTH = 20
+"""Characters of a progress bar, so that count, time and some of the step fit into 80 columns."""
 _LINE_WIDTH = 120
 """Characters of a wrapped line at most."""
 
@@ -76,6 +77,11 @@ def write(text: str = "", *, colours: Mapping[str, int] | None = None) -> None:
     sys.stdout.flush()
 
 
+def write_prose(text: str) -> None:
+    """Write a sentence to standard output: broken at blanks on a terminal, in one line for programs."""
+    write(wrapped(text) if sys.stdout.isatty() else text)
+
+
 def note(text: str) -> None:
     """Write a line to standard error, only on a terminal and without ``--json``."""
     if sys.stderr.isatty():
@@ -115,6 +121,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
         Exit: Something was checked and is not `verified`; the code is 4.
     """
     if _json_mode:
+        from pydantic_core import from_json, to_json
+
         text = to_json(value, inf_nan_mode="null", fallback=_as_json)
         # `json.dumps` escapes what a terminal would execute
         sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")
@@ -284,24 +292,27 @@ def _progress_bar(label: str, unit: str) -> Iterator[Advance]:
     """A bar of rich's, with the amount in bytes or as a count; it disappears at its end."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.table import Column
 
     amount = (
         DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
     )
+    # where there is little room, the step is cut, and nothing else
+    step_column = Column(no_wrap=True, overflow="ellipsis", ratio=1)
     columns = [
         TextColumn("{task.description}", markup=False),
-        BarColumn(),
+        BarColumn(bar_width=_BAR_WIDTH),
         amount,
         TimeRemainingColumn(),
+        TextColumn("{task.fields[step]}", markup=False, table_column=step_column),
     ]
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(printable(label), total=1)
+    with Progress(*columns, console=Console(stderr=True), transient=True, expand=True) as bar:
+        task = bar.add_task(printable(label), total=1, step="")
 
         def update(done: float, total: float | None, step: str = "") -> None:
-            text = printable(f"{label}: {step}" if step else label)
             # rich needs a total: an unknown one stays one ahead
             total = done + 1 if total is None else total
-            bar.update(task, completed=done, total=total, description=text)
+            bar.update(task, completed=done, total=total, step=printable(step))
 
         yield update
 

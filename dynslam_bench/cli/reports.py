@@ -6,7 +6,7 @@ from typing import Annotated, Optional
 import typer
 
 from dynslam_bench.cli.options import AsJson, DataRoot, DefaultGroup, ProtocolId, names_of
-from dynslam_bench.cli.output import present, progress, report_table, wrapped
+from dynslam_bench.cli.output import announce, present, progress, report_table, warn, wrapped
 from dynslam_bench.core import ReportError, did_you_mean, find_data_root, write_atomic
 
 MOST_ROWS = 5
@@ -29,7 +29,10 @@ MostPages = Annotated[
 @app.command()
 def make(
     results: Annotated[
-        Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")
+        Optional[list[Path]],
+        typer.Argument(
+            help="Results folders, default ./results; manifests of trajectories (.toml) become banks here."
+        ),
     ] = None,
     output: Annotated[
         Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")
@@ -69,9 +72,10 @@ def make(
 
     if on not in ("common", "all"):
         raise ReportError(f"--on is 'common' or 'all', got '{on}'")
+    sources = [banked(source) for source in results or [Path("results")]]
     with progress("report") as advance:
         paths = report(
-            results or "results",
+            sources,
             output,
             protocol=protocol,
             reference=reference,
@@ -84,11 +88,12 @@ def make(
         )
 
     # the headline, the first rows of the leaderboard, what is not in it, and the page
-    columns = ["#", "tracker", "ATE ratio", "better?", "success", "coverage", "× real time"]
     board = paths.leaderboard
+    in_mm = [column.name for column in board.columns if column.name.endswith(", mm")]
+    columns = ["#", "tracker", *in_mm, "better?", "success", "coverage", "× real time"]
     more = len(board.rows) - MOST_ROWS
     lines = [
-        wrapped(paths.headline),
+        *(wrapped(sentence) for sentence in [*paths.answers, paths.headline]),
         report_table(board, columns, MOST_ROWS),
         f"... and {more} more; {board.brief}" if more > 0 else board.brief,
     ]
@@ -96,8 +101,22 @@ def make(
         lines.append(wrapped(f"Left out: {trial_words(paths.trials)}."))
     lines += failure_lines(paths.csv.get("failures"))
     lines.append(str(paths.html))
-    facts = ("headline", "html", "markdown", "latex", "csv", "data")
+    facts = ("headline", "answers", "html", "markdown", "latex", "csv", "data")
     present({name: getattr(paths, name) for name in facts}, *lines)
+
+
+def banked(source: Path) -> Path:
+    """The bank that the trajectories of a manifest are added to, named as it is; another source as it is."""
+    if source.suffix != ".toml":
+        return source
+    from dynslam_bench.runs.bank import add
+
+    bank = Path(source.stem)
+    merged = add([source], bank)
+    announce(f"{source}: {len(merged.added)} trajectories added to the bank {bank}")
+    for entry in merged.left_out:
+        warn(f"left out {entry.path}: {entry.reason}")
+    return bank
 
 
 def failure_lines(file: Path | None) -> list[str]:
@@ -135,6 +154,13 @@ def publish(
     ] = "",
     protocol: ProtocolId = "tum-rgbd/v1",
     most_pages: MostPages = None,
+    most_pictures: Annotated[
+        Optional[int],
+        typer.Option(
+            min=0,
+            help="Runs whose page has pictures, 0.4 MB each; default all failures and typical runs.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a static site of stored runs and a study: one folder for any web server, or a repository."""
@@ -149,6 +175,7 @@ def publish(
             note=remark,
             protocol=protocol,
             most_pages=most_pages,
+            most_pictures=most_pictures,
             on_progress=advance,
         )
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")

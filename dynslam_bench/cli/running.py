@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,14 @@ from dynslam_bench.cli.output import (
     write_error,
 )
 from dynslam_bench.cli.runs import recording_note, show_files, show_runs, training_scene_note
-from dynslam_bench.core import DynslamError, RunError, label_text, weights_folder
+from dynslam_bench.core import (
+    DynslamError,
+    RunError,
+    call_periodically,
+    label_text,
+    weights_folder,
+)
+from dynslam_bench.core.folders import kernel_files
 
 if TYPE_CHECKING:
     from dynslam_bench.api import RunResult
@@ -53,8 +61,8 @@ def run(
     ],
     seed: opts.Seeds = None,
     offset: opts.Offsets = None,
-    assignments: opts.Assignments = None,
-    settings: opts.SettingsFile = None,
+    set_options: opts.Assignments = None,
+    settings_file: opts.SettingsFile = None,
     preset: Annotated[
         Optional[str],
         typer.Option(
@@ -178,14 +186,15 @@ def run(
     as_json: opts.AsJson = False,
 ) -> None:
     """Run a tracker on sequences; runs that are stored already are not made again."""
-    from dynslam_bench.api import checked, make_specs, run_specs
+    from dynslam_bench.api import make_specs, run_specs, validated_record
 
     # settings: --settings below --set, and the two options that stand for settings above both
-    overrides = opts.gather_settings(assignments, settings)
+    overrides = opts.gather_settings(set_options, settings_file)
     if start_map is not None:
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
+    announce_recordings(sequences, camera)
     # one specification for each sequence, seed and offset
     specs = make_specs(
         tracker,
@@ -210,7 +219,7 @@ def run(
         save_map=save_map,
         label=label,
         degrade=opts.gather_settings(degrade),
-        limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
+        limits=validated_record(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )
     # made, then shown with their errors
     scored_under = protocol or default_protocol(tracker)
@@ -218,6 +227,18 @@ def run(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
     make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
+
+
+def announce_recordings(sequences: list[str], camera: str | None) -> None:
+    """Say what the folders among the sequences are taken for; one that cannot be opened is reported with its run."""
+    from dynslam_bench.sequences import open_sequence
+
+    for name in sequences:
+        if not Path(name).expanduser().is_dir():
+            continue
+        with suppress(DynslamError):
+            for line in getattr(open_sequence(name, camera=camera), "taken_for", ()):
+                announce(line)
 
 
 def default_protocol(tracker: str) -> str:
@@ -312,7 +333,7 @@ def bench(
 
 
 def show_workers(rows: Sequence[dict[str, object]]) -> None:
-    """What each worker of a scheduler has, on standard error."""
+    """Show on standard error what each worker of a scheduler has."""
     if not rows:
         announce("the scheduler has no worker yet")
         return
@@ -371,7 +392,8 @@ def make_and_show(
     rows = show_runs((run.record for run in made), store, protocol, watched.reused)
     missing_files = show_files(rows, store, pictures)
     show_cautions(rows, watched)
-    note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
+    counted = f"{len(rows)} run{'s' if len(rows) != 1 else ''}"
+    note(f"{counted} in {store.root}; report them with: dynslam-bench report {results}")
 
     # what scripts see: the exit code
     not_ok = any(row["status"] != "ok" for row in rows)
@@ -432,6 +454,10 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
     return typer.confirm("Download it?", default=True, err=True)
 
 
+COMPILED_S = 1.0
+"""How often is looked for compiled kernels."""
+
+
 class WatchedRuns:
     """The events of runs as a progress bar, and what is known of the runs afterwards.
 
@@ -453,31 +479,55 @@ class WatchedRuns:
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
-        # finished runs, and of running ones the share of their frames that is done
-        self._done = 0.0
-        self._shares: dict[str, float] = {}
+        # frames of all runs that are made, of those that have ended, and of running ones
+        self._planned = runs.Plan()
+        self._done = 0
+        self._running: dict[str, int] = {}
+        self._ended_runs = 0
+        # the newest event's text, for what is said between events
+        self._step = "opening sequences"
+        self._kernels_before = set(kernel_files())
 
     def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
-        with progress("runs") as self._advance:
-            self._advance(0, None, "opening sequences")
+        with (
+            progress("frames") as self._advance,
+            call_periodically(COMPILED_S, self._say_what_is_compiled),
+        ):
+            self._advance(0, None, self._step)
             return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
 
+    def _say_what_is_compiled(self) -> None:
+        """While no frame is done, how many kernels a system's first run on this machine has compiled."""
+        compiled = len(set(kernel_files()) - self._kernels_before)
+        if compiled and not self._done and not self._running:
+            self._show(f"{self._step}, {compiled} kernels compiled, once")
+
+    def _show(self, step: str) -> None:
+        """Show how many frames are tracked, of all that the runs have."""
+        done = self._done + sum(self._running.values())
+        self._advance(done, self._planned.frames.total() or None, step)
+
     def _plan(self, plan: runs.Plan) -> None:
+        self._planned = plan
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
     def _event(self, event: runs.RunEvent) -> None:
-        """Count a run that has ended as 1, one that goes on as the share of its frames."""
-        # the share that this run has added to the bar so far
-        before = self._shares.pop(event.run_id, 0.0)
+        """Count the frames that are tracked, of all that the runs have."""
         if event.record is not None:
-            self._done += 1.0 - before
+            self._running.pop(event.run_id, None)
+            if event.kind == "finished":
+                self._done += event.record.n_frames
+                self._ended_runs += 1
             self._ended(event, event.record)
         elif event.partial is not None:
-            share = event.partial["frames_done"] / max(event.partial["frames"], 1)
-            self._shares[event.run_id] = share
-            self._done += share - before
-        self._advance(self._done, event.total, event_text(event))
+            self._running[event.run_id] = event.partial["frames_done"]
+
+        self._step = event_text(event)
+        if self._planned.runs > 1:
+            number = min(self._ended_runs + 1, self._planned.runs)
+            self._step = f"run {number} of {self._planned.runs}, {self._step}"
+        self._show(self._step)
 
     def _ended(self, event: runs.RunEvent, record: runs.RunRecord) -> None:
         """Remember what a run was asked to open and whether it was stored, and write a line on it."""
@@ -487,7 +537,9 @@ class WatchedRuns:
         if event.kind == "reused":
             self.reused.add(record.run_id)
             line += " (stored)"
-        note(line)
+        # a single run is shown in full when it has ended
+        if event.total > 1:
+            note(line)
 
     def _fault(self, _: runs.RunSpec, error: DynslamError) -> None:
         if str(error) not in self.faults:
@@ -496,8 +548,11 @@ class WatchedRuns:
 
 
 def event_text(event: runs.RunEvent) -> str:
-    """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
+    """Tracker and sequence of a run and what it does, for a progress bar."""
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
+    if event.kind == "started":
+        # nothing is heard of a run before its first frames
+        return f"{text}, starting: a first run compiles its code"
     if event.kind != "progress" or event.partial is None:
         return text
     done = event.partial["frames_done"]

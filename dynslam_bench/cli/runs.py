@@ -32,6 +32,7 @@ from dynslam_bench.cli.output import (
     table,
     warn,
     write,
+    write_prose,
 )
 from dynslam_bench.core import (
     RunError,
@@ -51,23 +52,24 @@ COLUMNS = {
     "tracker": "tracker",
     "sequence": "sequence",
     "status": "status",
-    "ATE (m)": "ate_rmse_m",
+    "ATE (mm)": "ate_rmse_m",
     "ms/frame": "frame_ms",
     "frames": "frames",
     "repeat": "repeat",
-    "reason": "reason",
     "settings": "settings",
     "coverage": "coverage",
     "masks": "segmentation",
-    "static camera (m)": "static_camera_ate_rmse_m",
-    "false motion (m)": "false_motion_max_m",
+    "static camera (mm)": "static_camera_ate_rmse_m",
+    "false motion (mm)": "false_motion_max_m",
     "identity": "identity",
     "from the store": "from_store",
     "study": "study",
 }
 """Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+_IN_METRES = ("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m")
+"""Errors of a row in metres, which are shown in millimetres."""
 MOST_REMARKS = 10
-"""Warnings and hints that are written below a table."""
+"""Warnings, hints and reasons that are written below a table."""
 HINT_FRAMES = 60
 """Frames of a recording that are checked when a run on it fails: a few seconds."""
 COLOURS = {
@@ -190,7 +192,9 @@ def show(
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
-    present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
+    present(
+        {"record": record, "metrics": metrics, "folder": store.shown_folder(record.run_id)}, *lines
+    )
 
 
 @app.command()
@@ -352,7 +356,7 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
     identity = "unverified: its id does not tell the contents of data and code"
     return {
         "run": record.run_id,
-        "folder": store.place(record.run_id),
+        "folder": store.shown_folder(record.run_id),
         "identity": "" if record.verified else identity,
         "status": record.status,
         "reason": record.reason,
@@ -391,7 +395,7 @@ def show_runs(
 
     Args:
         records: The runs.
-        store: Where they are stored.
+        store: Store that holds the runs.
         protocol: How their errors are evaluated.
         reused: Ids of the runs that are marked as taken from the store.
 
@@ -403,15 +407,60 @@ def show_runs(
         # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
         rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
-    show_rows(rows, store, protocol)
+    if len(rows) == 1 and not json_mode():
+        show_run(rows[0], store)
+    else:
+        show_rows(rows, store, protocol)
     return rows
+
+
+def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
+    """Show a single run in a few lines: its errors in millimetres, its trajectory, what is to be said of it."""
+    record = store.read_whole(row["run_id"])
+    part = f" [{row['frames']}]" if row["frames"] else ""
+    where = f"{label_text(row['tracker'])} on {row['sequence']}{part}, {row['repeat']}"
+    write(f"{where}: {row['status']}{' (from the store)' if row['from_store'] else ''}")
+
+    # the error beside that of a camera that does not move
+    error = ""
+    if row["ate_rmse_m"] is not None:
+        error = f"{millimetres(row['ate_rmse_m'])} mm"
+    static_m = row["static_camera_ate_rmse_m"]
+    if error and static_m and row["false_motion_max_m"] is None:
+        error += f", not moving {millimetres(static_m)} mm"
+    false_motion = row["false_motion_max_m"]
+
+    # the trajectories that the run left
+    trajectories = {}
+    for name, which in (("trajectory", "online"), ("final trajectory", "final")):
+        path = store.folder(row["run_id"]) / f"trajectory_{which}.txt"
+        if path.is_file():
+            trajectories[name] = str(path)
+    facts = {
+        "ATE": error,
+        "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
+        "frames": f"{record.n_tracked} of {record.n_frames} tracked",
+        "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
+        "settings": shown_cell("settings", row["settings"]),
+        "masks": shown_cell("segmentation", row["segmentation"]),
+        "identity": row["identity"],
+        **trajectories,
+        "run": row["run_id"],
+    }
+    write(fields(facts))
+    for line in summary_lines([dict(row)]):
+        write_prose(line)
+    show_remarks([dict(row)])
 
 
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
     """Show rows as `list_runs` gives them, as a table or JSON; the table has the columns in which a run has a value."""
     if json_mode():
         present(
-            [row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows]
+            [
+                row | {"protocol": protocol, "folder": store.shown_folder(row["run_id"])}
+                for row in rows
+            ]
         )
         return
     # columns without any value are left out
@@ -429,7 +478,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in shown]
     write(table(list(columns), cells), colours=COLOURS)
     for line in summary_lines(rows):
-        write(line)
+        write_prose(line)
     show_remarks(rows)
 
 
@@ -438,7 +487,7 @@ def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")
-    if counts:
+    if counts and len(rows) > 1:
         statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
         lines.append(f"{counts.total()} of {len(rows)} runs are not ok: {statuses}.")
 
@@ -446,7 +495,9 @@ def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     moving = [row for row in rows if row["false_motion_max_m"] is None]
     errors = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving]
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in errors)
-    if worse:
+    if worse and len(rows) == 1:
+        lines.append("The run is worse than a static camera.")
+    elif worse:
         lines.append(f"{worse} of {len(rows)} runs are worse than a static camera.")
 
     # lost frames are in no ATE: it must not be compared as it stands
@@ -459,21 +510,26 @@ def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
-    """Write the warnings and hints of runs, one line for all runs that share one; `MOST_REMARKS` at most."""
+    """Write why runs ended, their warnings and hints, once for all runs that share one; `MOST_REMARKS` at most."""
     runs_by_remark = defaultdict[str, list[dict[str, Any]]](list)
     for row in rows:
-        for remark in row.get("remarks", ()):
+        remarks = list(row.get("remarks", ()))
+        if row.get("reason"):
+            remarks.insert(0, f"{row['status']}: {row['reason']}")
+        for remark in remarks:
             if row["tracker"] == "never-move" and remark.startswith("warning: static-camera:"):
                 continue  # it is that camera
             runs_by_remark[remark].append(row)
     # one line for all runs with the same remark
     for remark, (first, *others) in list(runs_by_remark.items())[:MOST_REMARKS]:
         kind, _, text = remark.partition(": ")
-        subject = f"{label_text(first['tracker'])} on {first['sequence']}"
+        subject = (
+            f"{label_text(first['tracker'])} on {first['sequence']}: " if len(rows) > 1 else ""
+        )
         if others:
             plural = "s" if len(others) != 1 else ""
-            subject += f" and {len(others)} more run{plural}"
-        write(f"{kind}: {subject}: {text}")
+            subject = subject.removesuffix(": ") + f" and {len(others)} more run{plural}: "
+        write_prose(f"{kind}: {subject}{text}")
     more = len(runs_by_remark) - MOST_REMARKS
     if more > 0:
         write(f"{more} more such lines: `dynslam-bench runs show RUN` has those of a run.")
@@ -492,10 +548,18 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     return {run_id: run_id[:count] for run_id, count in digits.items()}
 
 
+def millimetres(metres: float) -> str:
+    """Metres as millimetres with three significant digits."""
+    value = f"{1000.0 * metres:#.3g}"
+    return f"{1000.0 * metres:.0f}" if "e+" in value else value.rstrip(".")
+
+
 def shown_cell(name: str, value: Any) -> Any:
-    """A cell of the table: paths without folders."""
+    """A cell of the table: errors in millimetres, paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
+    if name in _IN_METRES and isinstance(value, float):
+        return millimetres(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
@@ -553,7 +617,9 @@ def recording_note(
 
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
-        if sequence.startswith("synthetic/") or not (row["status"] != "ok" or _is_no_better(row)):
+        if sequence.startswith("synthetic/") or not (
+            row["status"] != "ok" or _is_no_better_than_static(row)
+        ):
             continue
         # the first such recording alone: each check takes seconds
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)
@@ -566,9 +632,9 @@ def recording_note(
     return ""
 
 
-def _is_no_better(row: Mapping[str, Any]) -> bool:
+def _is_no_better_than_static(row: Mapping[str, Any]) -> bool:
     """Whether a tracker that is to follow a moving camera was no better than a static camera."""
-    # where the camera stands still, no tracker can be better
+    # `false_motion_max_m` is measured before a fixed camera only, where a static camera has no error
     error = row["ate_rmse_m"]
     bound = row["static_camera_ate_rmse_m"]
     if row["tracker"] == "never-move" or row["false_motion_max_m"] is not None:

@@ -35,7 +35,7 @@ app = typer.Typer(
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
-    assignments: Annotated[
+    set_options: Annotated[
         Optional[list[str]],
         typer.Option(
             "--set",
@@ -43,7 +43,7 @@ def train(
             help="Set one of the training's, e.g. iterations=1200; repeatable.",
         ),
     ] = None,
-    settings: Annotated[
+    settings_file: Annotated[
         Optional[Path],
         typer.Option("--settings", help="TOML file of the training's settings."),
     ] = None,
@@ -57,11 +57,11 @@ def train(
 ) -> None:
     """Train a Mask R-CNN with a cross-layer feature pyramid; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.training.settings import TrainSettings
     from dynslam_bench.segmentation.training.train import train as train_network
 
-    chosen = apply_overrides(TrainSettings(), gather_settings(assignments, settings))
+    chosen = apply_overrides(TrainSettings(), gather_settings(set_options, settings_file))
     with progress("training") as advance:
         result = train_network(
             chosen,
@@ -84,7 +84,7 @@ def evaluate(
     source: Annotated[
         str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")
     ] = "embedded",
-    assignments: MaskAssignments = None,
+    set_options: MaskAssignments = None,
     output: Annotated[
         Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")
     ] = None,
@@ -96,12 +96,12 @@ def evaluate(
 ) -> None:
     """Measure a segmenter's masks against labels."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
     settings = apply_overrides(
-        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+        SegmentationSettings(), {"source": source, **gather_settings(set_options)}
     )
     with progress(data) as advance:
         score = evaluate_segmenter(
@@ -129,7 +129,7 @@ def record(
         Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")
     ],
     source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
-    assignments: MaskAssignments = None,
+    set_options: MaskAssignments = None,
     frames: Frames = None,
     data_root: DataRoot = None,
     camera: Camera = None,
@@ -138,13 +138,13 @@ def record(
 ) -> None:
     """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
-    from dynslam_bench.envs import resolve_device
+    from dynslam_bench.envs.slam_env import resolve_device
     from dynslam_bench.segmentation.record import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences import open_sequence
 
     settings = apply_overrides(
-        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+        SegmentationSettings(), {"source": source, **gather_settings(set_options)}
     )
     opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)
     with progress(f"masks of {opened.id}") as advance:

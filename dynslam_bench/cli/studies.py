@@ -250,16 +250,23 @@ class StudyBar:
 
 def show_summary(tuner: tuning.Study, summary: tuning.StudySummary, page: Path) -> None:
     """Show the conclusion, the best settings and the paths of page and preset."""
+    from dynslam_bench.tuning.judgement import next_step
     from dynslam_bench.tuning.plan import seen_note
 
     preset = tuner.folder / "best.toml"
+    best = summary.best
     lines = [summary.conclusion]
+    if best is not None and best.scene_errors:
+        lines.append(best.errors_sentence)
     if caution := seen_note(summary.seen):
         lines.append(caution)
     lines.append("")
-    if summary.best is not None:
+    if best is not None:
         if not summary.is_to_use:
             lines.append("The best trial's settings, which are no result to use:")
-        lines += [table(("setting", "value"), list(summary.best.params.items())), ""]
+        lines += [table(("setting", "value"), list(best.params.items())), ""]
     lines.append(f"preset: {preset}\npage:   {page}")
+    configuration = tuner.configuration(best.params if best is not None else {})
+    sentence, command = next_step(tuner.spec, summary, tuner.baseline, configuration)
+    lines += ["", sentence, f"  {command}"]
     present({"summary": summary, "page": page, "preset": preset}, *lines)

@@ -176,8 +176,8 @@ def doctor(as_json: AsJson = False) -> None:
 @app.command()
 def test(
     tracker: Tracker,
-    assignments: Assignments = None,
-    settings: SettingsFile = None,
+    set_options: Assignments = None,
+    settings_file: SettingsFile = None,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,
     time_limit: Annotated[
         float,
@@ -200,7 +200,7 @@ def test(
     with progress("checking") as advance:
         report = isolated_tracker_report(
             tracker,
-            settings=gather_settings(assignments, settings),
+            settings=gather_settings(set_options, settings_file),
             frames=frames,
             frame_s=time_limit,
             start_s=5 * time_limit,

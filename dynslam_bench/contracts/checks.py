@@ -212,9 +212,10 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
         The trajectory.
 
     Raises:
-        TrackerContractError: It has one.
+        TrackerContractError: The trajectory has a fault.
     """
-    for fault in trajectory_faults(trajectory):
+    fault = next(iter(trajectory_faults(trajectory)), None)
+    if fault is not None:
         raise TrackerContractError(
             f"tracker '{tracker}' in finalize() returned {fault.found}", fault.cause
         )

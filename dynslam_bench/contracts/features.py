@@ -63,7 +63,11 @@ class FeatureSpec:
 
 @runtime_checkable
 class FeatureExtractor(Protocol):
-    """Finds keypoints; deterministic."""
+    """Finds keypoints; deterministic.
+
+    The pipeline enlarges images narrower than 640 pixels before, and divides the keypoints' pixels
+    afterwards.
+    """
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image; none is an empty result."""

@@ -57,7 +57,7 @@ class FrameBundle:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeView:
-    """What a filter may see of a keyframe.
+    """The part of a keyframe that a filter may read.
 
     Attributes:
         T_world_cam: Camera-to-world pose ``[4, 4]``.
@@ -80,7 +80,7 @@ class KeyframeView:
 
 @dataclass(eq=False)
 class FilterState:
-    """What is known beside the frame itself, shared by all filters of a pipeline.
+    """Input of all filters of a pipeline beside the frame itself: poses, the previous frame, flow and the map.
 
     Attributes:
         camera: Intrinsics (with the raw images' distortion).
@@ -150,10 +150,16 @@ class FilterResult:
         stats: Mapping[str, float] | None = None,
         mask: NDArray[np.bool_] | None = None,
     ) -> FilterResult:
-        """A verdict with weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``."""
-        verdict = np.asarray(keep, dtype=bool)
-        counts = {"dropped": float(np.count_nonzero(~verdict)), **(stats or {})}
-        return cls(verdict, verdict.astype(np.float32), counts, mask)
+        """From a keep mask ``[N]``: weights 1 (kept) and 0 (dropped); `stats` gains ``dropped``.
+
+        Args:
+            keep: bool ``[N]``.
+            stats: Further counts.
+            mask: bool ``[H, W]``, see the class.
+        """
+        kept = np.asarray(keep, dtype=bool)
+        counts = {"dropped": float(np.count_nonzero(~kept)), **(stats or {})}
+        return cls(kept, kept.astype(np.float32), counts, mask)
 
 
 @runtime_checkable

@@ -64,7 +64,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class SegmenterContext:
-    """What a segmenter is told of where it runs.
+    """The surroundings in which a segmenter runs: sequence, device, threads, source.
 
     Attributes:
         sequence_id: Id of the sequence.
@@ -94,7 +94,7 @@ class SegmenterSpec:
         entry_point: ``"module:factory"``, called as ``factory(settings, context)`` with
             `SegmentationSettings` and `SegmenterContext`; returns a `Segmenter`.
         summary: One line.
-        license: Of code and weights, SPDX id or remark.
+        license: License of code and weights: an SPDX id or a remark.
         citation: What to cite.
     """
 

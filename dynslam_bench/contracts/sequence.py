@@ -99,7 +99,7 @@ class Sequence(Protocol):
 
 
 def read_only(frame: Frame) -> Frame:
-    """The same frame with images that cannot be written, for code of others; no pixel is copied.
+    """A copy of the frame whose images cannot be written, for code of others; no pixel is copied.
 
     A data set may keep its frames, so that what one tracker writes into them would reach the next.
     """
@@ -107,7 +107,7 @@ def read_only(frame: Frame) -> Frame:
 
 
 def read_only_masks(masks: FrameMasks) -> FrameMasks:
-    """The same masks, which cannot be written."""
+    """A copy of the masks that cannot be written; no pixel is copied."""
     return replace(
         masks, instances=_read_only_view(masks.instances), class_names=dict(masks.class_names)
     )

@@ -71,11 +71,11 @@ class TrackerSpec:
         sensors: What it looks at: ``rgbd``; or ``rgb``, colour alone: it runs without depth, and
             the unit of length of its poses is its own, so that it is scored under protocols with
             Sim(3) alignment only.
-        deterministic: Same seed, same bits.
+        deterministic: Whether two runs with the same seed give the same poses to the bit.
         provenance: How closely it follows its source.
         ranked: Whether leaderboards rank it by default.
         presets: Named overrides, dotted name to value.
-        version: Of the tracker, part of a run's identity.
+        version: Version of the tracker, part of a run's identity.
         license: SPDX id or remark.
         citation: What to cite.
         assumptions: What was assumed where the source is silent.

@@ -36,7 +36,8 @@ def names_wrong_arguments(target: Target) -> Target:
             raise
         except Exception as error:
             wrong = None
-            # it fails for names that do not fit, and annotations that cannot be checked
+            # `bind` raises where names do not fit, and the check where an annotation cannot be
+            # checked: then the first error stands
             with suppress(Exception):
                 if _is_of_this_package(error):
                     arguments = inspect.signature(target).bind(*args, **kwargs).arguments

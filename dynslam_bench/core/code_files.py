@@ -81,7 +81,7 @@ def is_code(file: Path) -> bool:
     return (file.suffix in CODE or ".so." in file.name) and file.is_file()
 
 
-def foreign_modules(file: Path) -> set[str]:
+def imports_outside_folder(file: Path) -> set[str]:
     """Top-level names of the modules outside its folder that a module imports, itself or through others of the folder.
 
     The identity of a program covers these modules, too. The standard library is among them.
@@ -93,7 +93,7 @@ def foreign_modules(file: Path) -> set[str]:
         OSError: A file cannot be read.
     """
     imported = set[str]()
-    foreign = set[str]()
+    outside = set[str]()
     waiting = [file]
     while waiting:
         # what the files that were found last import
@@ -101,7 +101,7 @@ def foreign_modules(file: Path) -> set[str]:
         imported |= names
         waiting = []
         for name in names:
-            # a name is a module or a package of the folder, or it is foreign
+            # a name is a module or a package of the folder, or it lies outside
             module = file.parent / f"{name}.py"
             package = file.parent / name
             if module.is_file():
@@ -109,8 +109,8 @@ def foreign_modules(file: Path) -> set[str]:
             elif package.is_dir():
                 waiting += files_below(package)
             else:
-                foreign.add(name)
-    return foreign
+                outside.add(name)
+    return outside
 
 
 def program_files(folder: Path) -> list[Path]:
@@ -239,7 +239,7 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
         code += program_files(script_folder)
     modules: set[str] = set()
     for script in scripts:
-        modules |= foreign_modules(script)
+        modules |= imports_outside_folder(script)
     for module in sorted(modules - set(sys.stdlib_module_names)):
         code += [file for file in _module_files(module, base) if not is_installed(file)]
 
@@ -327,7 +327,7 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
 
 
 def _named(code: list[Path], others: list[Path]) -> list[Path]:
-    """Those of the other files that the code names; what they name in turn counts, too."""
+    """Files among `others` that the code names; what they name in turn counts, too."""
     files: list[Path] = []
     waiting = list(code)
     while waiting and others:

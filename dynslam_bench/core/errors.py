@@ -166,7 +166,7 @@ def translate_errors(
         of: What is caught.
 
     Raises:
-        DynslamError: Of the given kind.
+        DynslamError: Raised as `kind`: the block raised an exception of the class `of`.
     """
     try:
         yield

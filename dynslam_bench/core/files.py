@@ -151,8 +151,8 @@ def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
     """Remove the temporary files and folders that killed processes left in a folder.
 
     Args:
-        folder: Where; nothing happens if it is missing.
-        pattern: Of the paths below it to look at, e.g. ``runs/.*``.
+        folder: Folder to clean; nothing happens if it is missing.
+        pattern: Glob pattern below `folder` of the paths to look at, e.g. ``runs/.*``.
     """
     for path in filter(is_temporary, folder.glob(pattern)):
         # it is locked while it is removed: a process that has just made it waits, and makes it again
@@ -304,7 +304,7 @@ class TemporaryFolder:
     It is locked while its process lives, so that `sweep` knows those of killed processes.
 
     Args:
-        base: Where; None for the system's folder of temporary files.
+        base: Folder in which it is made; None for the system's folder of temporary files.
 
     Raises:
         OSError: It cannot be made.

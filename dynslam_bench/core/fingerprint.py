@@ -27,7 +27,7 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
 from dynslam_bench.core.records import Record, digest
-from dynslam_bench.core.settings import Settings, field_names, named
+from dynslam_bench.core.settings import Settings, field_names, references_of
 from dynslam_bench.core.version import release, version
 
 OPENCV = (
@@ -64,7 +64,7 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
         PluginError: One cannot be read.
     """
     # declared names, also where nothing tells them from a word
-    references = named(settings)
+    references = references_of(settings)
     texts = {name: value for name, (kind, value) in references.items() if kind == "file"}
 
     # then what is written as a path, at any depth of a setting's value
@@ -354,7 +354,7 @@ def git_revision() -> GitRevision | None:
 
 
 def _output_of(*command: str) -> str:
-    """What a command writes, without white space around it.
+    """The output of a command, without white space around it.
 
     Raises:
         OSError: It cannot be started.

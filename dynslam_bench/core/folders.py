@@ -16,6 +16,8 @@ STAGES_VARIABLE = "DYNSLAM_BENCH_CACHE"
 """Names the folder that holds the stage cache, remembered digests and compiled kernels."""
 WEIGHTS_VARIABLE = "DYNSLAM_BENCH_WEIGHTS"
 """Names the folder of downloaded weights."""
+KERNEL_SUFFIX = ".kernel"
+"""How the names of compiled kernels end."""
 
 
 def user_cache() -> Path:
@@ -56,6 +58,14 @@ def digest_cache_folder() -> Path:
 def kernels_folder() -> Path:
     """The folder of compiled kernels: ``kernels/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
     return _folder_in(STAGES_VARIABLE, user_cache()) / "kernels"
+
+
+def kernel_files() -> list[Path]:
+    """The files of compiled kernels, see `core.kernel_cache`; none for a user without a home folder."""
+    try:
+        return sorted(kernels_folder().glob(f"*{KERNEL_SUFFIX}"))
+    except RuntimeError:
+        return []
 
 
 def weights_folder() -> Path:

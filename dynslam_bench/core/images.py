@@ -67,8 +67,8 @@ def read_image(
         ``[H, W]`` or ``[H, W, C]`` with blue first, as OpenCV gives it.
 
     Raises:
-        DynslamError: Of the given kind: the file is missing, empty, truncated, of another size or
-            no image.
+        DynslamError: Raised as `kind`: the file is missing, empty, truncated, of another size or no
+            image.
     """
     import cv2
 

@@ -23,7 +23,7 @@ from numba.core.serialize import dumps
 
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import sweep_temporary, write_atomic
-from dynslam_bench.core.folders import kernels_folder
+from dynslam_bench.core.folders import KERNEL_SUFFIX, kernels_folder
 from dynslam_bench.core.kernel_code import (
     Foreign,
     NotDescribedError,
@@ -32,12 +32,10 @@ from dynslam_bench.core.kernel_code import (
 )
 from dynslam_bench.core.module_graph import PACKAGE, module_graph
 
-SUFFIX = ".kernel"
-"""How the names of the files end."""
 UNUSED_S = 30 * 24 * 3600
 """Files that nobody has loaded for so long are removed: the kernels of one state of the sources take some 7 MB."""
 _DIGITS = 32
-"""Of each digest in a name; two of 10^9 states would share 32 hexadecimal digits with a probability of 10^-21."""
+"""Hexadecimal digits of each digest in a name: two of 10^9 states would share 32 with a probability of 10^-21."""
 
 _NO_FOLDER = (OSError, RuntimeError)
 """What is raised where sources cannot be read, or where the user has no home folder."""
@@ -87,15 +85,18 @@ class KernelCompiler(Compiler):
 def load_kernels() -> None:
     """Load what lies on disk of all kernels, and with it the rest of numba.
 
-    Processes that are forked from this one have it then; else each takes 0.4 s to load it.
+    Processes that are forked from this one have it then; else each takes 0.4 s to load it. Kernels
+    for types that are no longer defined are passed over.
     """
-    files = sorted(kernels_folder().glob(f"*{SUFFIX}"))
+    files = sorted(kernels_folder().glob(f"*{KERNEL_SUFFIX}"))
     for kernel in list(KERNELS.values()):
         prefix = _name_prefix(kernel)
         for file in files:
             content = _read(file) if prefix and file.name.startswith(prefix) else None
-            if content is not None:
-                # the first of the two objects in it: the types
+            if content is None:
+                continue
+            # the first of the two objects in it: the types, of which another version's may be gone
+            with contextlib.suppress(AttributeError, ImportError):
                 kernel.compile(pickle.loads(content))
 
 
@@ -118,7 +119,7 @@ def kernel_file(
         return None
     try:
         signature = signature_digest(arguments, return_type, flags)
-        return kernels_folder() / f"{prefix}{signature[:_DIGITS]}{SUFFIX}"
+        return kernels_folder() / f"{prefix}{signature[:_DIGITS]}{KERNEL_SUFFIX}"
     except (NotDescribedError, *_NO_FOLDER):
         return None
 
@@ -145,7 +146,7 @@ class _Serializer(CompileResultCacheImpl):
 
 
 def _read(file: Path) -> bytes | None:
-    """What a file holds; None if it is missing, cut off, damaged or was written under another name."""
+    """The compiled kernel in a file; None if it is missing, cut off, damaged or was written under another name."""
     try:
         header, _, content = file.read_bytes().partition(b"\n")
     except OSError:
@@ -186,11 +187,11 @@ def remove_unused(folder: Path, now: float) -> None:
     """Remove the kernels that nobody has loaded for `UNUSED_S`, and what killed processes left half-written.
 
     Args:
-        folder: Where they lie; it may be missing.
+        folder: Folder of the compiled kernels; it may be missing.
         now: The time, in seconds since the epoch.
     """
     sweep_temporary(folder)
-    for file in folder.glob(f"*{SUFFIX}"):
+    for file in folder.glob(f"*{KERNEL_SUFFIX}"):
         # another process has removed it, or the folder can only be read
         with contextlib.suppress(OSError):
             if now - file.stat().st_mtime > UNUSED_S:

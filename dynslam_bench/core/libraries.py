@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dynslam_bench.core.code_files import files_below
 from dynslam_bench.core.fingerprint import contents_digest
-from dynslam_bench.core.reads import Anchors, ImportPath, search_now
+from dynslam_bench.core.reads import BaseFolders, ImportPath, search_now
 
 SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
 """Variables of the linker: with others the same module may run other code."""
@@ -41,6 +41,8 @@ def library_identity(module: str, imports: ImportPath | None = None) -> str:
 
 def search_path() -> dict[str, str]:
     """The folders or libraries that each variable of the linker names; variables that are not set are left out."""
-    anchors = Anchors(plugin=None, work=Path.cwd())
-    folders_by_name = {name: search_now(name, os.environ, anchors) for name in SEARCH_VARIABLES}
+    base_folders = BaseFolders(plugin=None, work=Path.cwd())
+    folders_by_name = {
+        name: search_now(name, os.environ, base_folders) for name in SEARCH_VARIABLES
+    }
     return {name: folders for name, folders in folders_by_name.items() if folders}

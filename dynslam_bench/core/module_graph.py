@@ -62,10 +62,10 @@ Reference = tuple[str, str]
 
 @dataclass(frozen=True)
 class ModuleCode:
-    """What is known of one module's source.
+    """One module's source: digest, imports and the names that it imports.
 
     Attributes:
-        digest: Of its syntax, see `syntax_digest`.
+        digest: Digest of the source's syntax, see `syntax_digest`.
         imports: What it imports from this package.
         names: What each name stands for that it imports at its top level, by the name that it has
             in this module.
@@ -277,6 +277,7 @@ def read_module(name: str, source: bytes) -> ModuleCode:
     """
     try:
         tree = parsed(source)
+        syntax = _tree_digest(tree)
     except (SyntaxError, ValueError, RecursionError):
         return ModuleCode(hashlib.sha256(source).hexdigest(), [], {})
     imports: set[Reference] = set()
@@ -287,12 +288,14 @@ def read_module(name: str, source: bytes) -> ModuleCode:
     names: dict[str, Reference] = {}
     for statement in tree.body:
         names |= _references(statement)
-    return ModuleCode(syntax_digest(source), sorted(imports), names)
+    return ModuleCode(syntax, sorted(imports), names)
 
 
 def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
     """All import statements below a node but those that only type checkers read."""
     for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.expr):
+            continue  # holds no statements
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child
         elif isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING"):
@@ -303,7 +306,7 @@ def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _references(statement: ast.AST) -> dict[str, Reference]:
-    """What a statement imports from this package, by the name that it gives to it."""
+    """References to this package's names in an import statement, by the name that the statement binds."""
     references: dict[str, Reference] = {}
     if isinstance(statement, ast.Import):
         for alias in statement.names:
@@ -336,27 +339,34 @@ def syntax_digest(source: bytes) -> str:
     bytes.
     """
     try:
-        words = "\0".join(_tokens_of(parsed(source)))
+        return _tree_digest(parsed(source))
     except (SyntaxError, ValueError, RecursionError):
         return hashlib.sha256(source).hexdigest()
-    return hashlib.sha256(words.encode(errors="backslashreplace")).hexdigest()
 
 
-def _tokens_of(node: Any) -> Iterator[str]:
-    """A syntax tree as text tokens; empty fields, which differ between versions of Python, are left out."""
+def _tree_digest(tree: ast.Module) -> str:
+    """`syntax_digest` of a source that is parsed already."""
+    tokens: list[str] = []
+    _append_tokens(tree, tokens)
+    return hashlib.sha256("\0".join(tokens).encode(errors="backslashreplace")).hexdigest()
+
+
+def _append_tokens(node: Any, tokens: list[str]) -> None:
+    """Append a syntax tree's text tokens; empty fields, which differ between versions of Python, are left out."""
     if isinstance(node, ast.AST):
-        yield f"({type(node).__name__}"
-        for name, value in ast.iter_fields(node):
+        tokens.append(f"({type(node).__name__}")
+        for name in node._fields:
+            value = getattr(node, name, None)
             if value is not None and value != [] and name not in ("ctx", "kind", "type_comment"):
-                yield name
-                yield from _tokens_of(value)
-        yield ")"
+                tokens.append(name)
+                _append_tokens(value, tokens)
+        tokens.append(")")
     elif isinstance(node, list):
         for inner in node:
             if not _is_docstring(inner):
-                yield from _tokens_of(inner)
+                _append_tokens(inner, tokens)
     else:
-        yield repr(node)
+        tokens.append(repr(node))
 
 
 def _is_docstring(node: Any) -> bool:

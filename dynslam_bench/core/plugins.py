@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
-from importlib.metadata import entry_points
 from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
@@ -32,7 +31,7 @@ Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequenc
 
 
 class Spec(Protocol):
-    """What every plug-in spec has."""
+    """The fields that every plug-in spec has."""
 
     @property
     def id(self) -> str:
@@ -190,7 +189,7 @@ class Registry(Generic[P]):
         return targets + self._installed()
 
     def _installed(self) -> list[Listed]:
-        """What the installed distributions list."""
+        """Entry points that the installed distributions list."""
         targets = []
         installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
         for point in sorted(installed, key=attrgetter("name")):
@@ -263,6 +262,8 @@ def _entry_points(*_path: str) -> Any:
     Args:
         *_path: The import path, so that another one is read again.
     """
+    from importlib.metadata import entry_points
+
     return entry_points()
 
 
@@ -324,8 +325,8 @@ def build_plugin(
         call: Calls the factory that it is given.
 
     Raises:
-        DynslamError: Of the type `fault` where the factory fails or gives something else; its own
-            pass unchanged.
+        DynslamError: Raised as `fault` where the factory fails or gives something else. A
+            `DynslamError` of the factory passes unchanged.
     """
     # what the factory raises names the plug-in
     factory = load_object(spec.entry_point)
@@ -388,8 +389,8 @@ def _load_file(path: Path) -> ModuleType:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    # from its text: byte code of an edit of equal length in the same second would pass for that of
-    # this one
+    # compile its text: cached byte code of an edit of equal length within the same second would pass
+    # for that of this text
     try:
         exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
     except BaseException:

@@ -236,12 +236,13 @@ def _is_there(path: str) -> bool:
 
 @dataclass
 class ProgramReads:
-    """What the processes of a program were made of.
+    """Files and commands of a program's processes.
 
     Attributes:
         files: Executables and everything that is mapped into memory, each with its time of
             modification when it was seen first, in nanoseconds; None where it was not there.
-        replaced: Of these, files in whose place another one lay already: what is mapped was removed.
+        replaced: Files of `files` that were removed while they were mapped: another file lies in
+            their place.
         commands: The command of each process.
     """
 
@@ -279,7 +280,7 @@ def mapped_files(pid: int) -> dict[str, bool]:
 
     Raises:
         OSError: The process has ended or is another user's.
-        psutil.Error: Likewise, on systems without ``/proc``.
+        psutil.Error: The process has ended or is another user's, on systems without ``/proc``.
     """
     maps = Path(f"/proc/{pid}/maps")
     if maps.is_file():

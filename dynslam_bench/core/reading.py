@@ -42,7 +42,7 @@ def read_bytes(
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, or is larger.
+        DynslamError: Raised as `kind`: the file cannot be read, or is larger than `limit` bytes.
     """
     # ValueError: a name with a null byte
     with (
@@ -64,7 +64,8 @@ def read_text(
     """Read a UTF-8 file of at most `limit` bytes; a byte order mark is left out.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, is larger, or is no UTF-8.
+        DynslamError: Raised as `kind`: the file cannot be read, is larger than `limit` bytes, or is
+            not UTF-8.
     """
     with translate_errors(kind, f"{path} is not a text file", of=UnicodeDecodeError):
         return read_bytes(path, limit=limit, kind=kind).decode("utf-8-sig")
@@ -76,8 +77,8 @@ def read_lines(
     """Read the lines of a UTF-8 file one after the other, so that a long file needs no memory of its own size.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, has more than `limit` bytes, or is no
-            UTF-8.
+        DynslamError: Raised as `kind`: the file cannot be read, is larger than `limit` bytes, or is
+            not UTF-8.
     """
     done = 0
     with (
@@ -98,8 +99,8 @@ def read_json(
     """Read the value in a JSON file.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, is larger than `limit` bytes, or is no
-            JSON.
+        DynslamError: Raised as `kind`: the file cannot be read, is larger than `limit` bytes, or is
+            not JSON.
     """
     return parse_json(read_text(path, limit=limit, kind=kind), str(path), kind=kind)
 
@@ -113,8 +114,8 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it is no JSON, nested too deeply, or holds a number of
-            thousands of digits.
+        DynslamError: Raised as `kind`: the text is not JSON, is nested too deeply, or holds a
+            number of thousands of digits.
     """
     with translate_errors(kind, f"{where} is no valid JSON", of=(ValueError, RecursionError)):
         return json.loads(text)
@@ -128,8 +129,8 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, is damaged, or holds or claims more than
-            `MOST_BYTES`.
+        DynslamError: Raised as `kind`: the file cannot be read, is damaged, or holds or claims more
+            than `MOST_BYTES`.
     """
     import numpy as np
 
@@ -177,7 +178,7 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: the list or a file cannot be read, or a name leads out of
+        DynslamError: Raised as `kind`: the list or a file cannot be read, or a name leads out of
             the folder.
     """
     faults = []

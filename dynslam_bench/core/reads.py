@@ -59,7 +59,7 @@ Entries = Annotated[dict[str, str], AfterValidator(_sorted)]
 class Reads(Record):
     """What foreign code read, by name; the digest `ABSENT` stands for what was not there.
 
-    Names of files begin in the folders of `Anchors`.
+    Names of files begin in the folders of `BaseFolders`.
 
     Attributes:
         files: SHA-256 of each file's bytes. A name that ends in a slash is that of a folder whose
@@ -73,7 +73,8 @@ class Reads(Record):
         modules: Where each module that was asked for was found, by its top-level name.
         distributions: Version and digest of the RECORD of each distribution whose modules were
             imported.
-        programs: The same of each file and folder that the processes of programs were made of.
+        programs: Digest of each file and folder that the processes of external programs were made
+            of: executables, libraries, and what their command lines name.
     """
 
     files: Entries = Field(default_factory=dict)
@@ -95,12 +96,12 @@ def digest_of(reads: Reads) -> str:
 
 
 @dataclass(frozen=True)
-class Anchors:
+class BaseFolders:
     """The folders in which names of files begin, so that names are equal on machines of equal layout.
 
     Args:
         plugin: The folder of the plug-in's file; None for a plug-in that is installed.
-        work: The working folder. It is no anchor where the home folder lies in it, e.g. ``/``: what
+        work: The working folder. It is no base where the home folder lies in it, e.g. ``/``: what
             lies there would have another name in each working folder.
     """
 
@@ -150,7 +151,7 @@ _DIGESTS: dict[tuple[str, str, int, int, int, int], str] = {}
 
 
 def remembered(kind: str, path: str, compute: Callable[[], str]) -> str:
-    """What is computed from a file, once in this process while the file's size, times and inode stay the same.
+    """A value that is computed from a file, once in this process while the file's size, times and inode stay the same.
 
     Raises:
         OSError: It is not there.
@@ -206,10 +207,10 @@ def folder_now(folder: str) -> str:
         return UNREADABLE
 
 
-def link_now(path: str, anchors: Anchors) -> str:
+def link_now(path: str, base_folders: BaseFolders) -> str:
     """The name of what a path leads to through symbolic links; `ABSENT` where it leads through none."""
-    target = anchors.name(os.path.realpath(path))
-    return ABSENT if target == anchors.name(path) else target
+    target = base_folders.name(os.path.realpath(path))
+    return ABSENT if target == base_folders.name(path) else target
 
 
 def value_digest(value: str | None) -> str:
@@ -217,21 +218,21 @@ def value_digest(value: str | None) -> str:
     return ABSENT if value is None else digest(value, 8)
 
 
-def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> str:
-    """What a search path holds, or which file a command is.
+def search_now(name: str, environment: Mapping[str, str], base_folders: BaseFolders) -> str:
+    """The folders of a search path, or the file that a command runs.
 
     Args:
         name: An environment variable that holds a search path; or `COMMAND` and the command's name.
         environment: The environment variables.
-        anchors: Where names of files begin.
+        base_folders: Where names of files begin.
 
     Returns:
         The names of the folders, or of the file; `ABSENT` where there is none.
     """
     if name.startswith(COMMAND):
         command = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
-        return ABSENT if command is None else anchors.name(os.path.abspath(command))
-    return anchors.names(folders_of(environment.get(name, "")))
+        return ABSENT if command is None else base_folders.name(os.path.abspath(command))
+    return base_folders.names(folders_of(environment.get(name, "")))
 
 
 class ImportPath:
@@ -344,14 +345,14 @@ class ImportPath:
                 namespace = place
         return namespace
 
-    def place(self, top: str, anchors: Anchors) -> str:
+    def place(self, top: str, base_folders: BaseFolders) -> str:
         """Where a top-level module is found: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
         module_file = self.find(top)
         if module_file:
             neighbours = self._names[os.path.dirname(module_file)]
             if any(name.endswith(_METADATA) for name in neighbours):
                 return INSTALLED
-        return anchors.name(module_file)
+        return base_folders.name(module_file)
 
 
 def _normalised(distribution: str) -> str:
@@ -399,7 +400,7 @@ class Verifier:
 
     Args:
         path: The import path of the runs; None for that of this process.
-        environment: Their environment variables; None for those of this process.
+        environment: Environment variables of the runs; None for those of this process.
     """
 
     def __init__(
@@ -407,48 +408,48 @@ class Verifier:
     ) -> None:
         self._imports = ImportPath(sys.path if path is None else path)
         self._environment = dict(os.environ if environment is None else environment)
-        self._now: dict[tuple[str, str, Anchors], str] = {}
-        self._unchanged: dict[tuple[str, Anchors], dict[str, str]] = {}
+        self._now: dict[tuple[str, str, BaseFolders], str] = {}
+        self._unchanged: dict[tuple[str, BaseFolders], dict[str, str]] = {}
 
-    def changed(self, reads: Reads, anchors: Anchors) -> str:
+    def changed(self, reads: Reads, base_folders: BaseFolders) -> str:
         """The first thing that has changed, in words: ``the file weights/net.onnx``; empty where nothing has.
 
         Args:
             reads: What a run read.
-            anchors: Where names of files begin now.
+            base_folders: Where names of files begin now.
         """
         for section in _SECTIONS:
             entries = getattr(reads, section)
             # most runs of a plug-in read the same
-            if self._unchanged.get((section, anchors)) == entries:
+            if self._unchanged.get((section, base_folders)) == entries:
                 continue
             for name, before in entries.items():
-                key = (section, name, anchors)
+                key = (section, name, base_folders)
                 now = self._now.get(key)
                 if now is None:
-                    now = self._look(section, name, anchors)
+                    now = self._look(section, name, base_folders)
                     self._now[key] = now
                 if now != before:
                     return _in_words(section, name, before)
-            self._unchanged[section, anchors] = entries
+            self._unchanged[section, base_folders] = entries
         return ""
 
-    def _look(self, section: str, name: str, anchors: Anchors) -> str:
+    def _look(self, section: str, name: str, base_folders: BaseFolders) -> str:
         """The digest that an entry of `Reads` would get now."""
         match section:
             case "search":
-                return search_now(name, self._environment, anchors)
+                return search_now(name, self._environment, base_folders)
             case "environment":
                 return value_digest(self._environment.get(name.removeprefix("$")))
             case "modules":
-                return self._imports.place(name, anchors)
+                return self._imports.place(name, base_folders)
             case "distributions":
                 return self._imports.distribution(name)
             case "folders":
-                return folder_now(anchors.path(name))
+                return folder_now(base_folders.path(name))
             case "links":
-                return link_now(anchors.path(name), anchors)
-        return content_now(anchors.path(name))
+                return link_now(base_folders.path(name), base_folders)
+        return content_now(base_folders.path(name))
 
 
 _SECTIONS = (
@@ -465,7 +466,7 @@ _SECTIONS = (
 
 
 def _in_words(section: str, name: str, before: str) -> str:
-    """What a user calls an entry of `Reads`."""
+    """A name in words for an entry of `Reads`."""
     short = re.sub("^(plugin|work):/", "", name)
     match section:
         case "search" if name.startswith(COMMAND):

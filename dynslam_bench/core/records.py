@@ -96,8 +96,8 @@ def validated(cls: type[Model], values: Any, where: str, kind: type[DynslamError
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: an unknown key (with a did-you-mean) or an unfit value, in
-            one line.
+        DynslamError: Raised as `kind`, in one line: an unknown key (with a did-you-mean), or a
+            value that does not fit.
     """
     try:
         return cls.model_validate(values)

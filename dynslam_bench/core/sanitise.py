@@ -65,7 +65,7 @@ def path_below(
         kind: Class of the error.
 
     Raises:
-        DynslamError: Of the given kind: the name is absolute, leads outside, or cannot be a file's.
+        DynslamError: Raised as `kind`: the name is absolute, leads outside, or cannot be a file's.
     """
     if not is_inside(name):
         raise kind(

@@ -171,7 +171,7 @@ def names(
     return Field(default, description=meaning, json_schema_extra=extra)
 
 
-def named(settings: Settings) -> dict[str, tuple[str, str]]:
+def references_of(settings: Settings) -> dict[str, tuple[str, str]]:
     """What the settings name: dotted name to ``(kind, value)``, see `names`; fields that name nothing are left out.
 
     A field of type `Path` counts as a file, too.
@@ -348,7 +348,7 @@ def _group_class(field: FieldInfo) -> type[Settings] | None:
 
 
 def _annotation(field: FieldInfo, key: str) -> dict[str, Any] | None:
-    """What `tunable` or `names` stored with a field under a key; None where nothing is stored."""
+    """The value that `tunable` or `names` stored with a field under a key; None where nothing is stored."""
     extra = field.json_schema_extra
     if not isinstance(extra, dict):
         return None

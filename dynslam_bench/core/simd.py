@@ -78,7 +78,7 @@ class SimdType(types.Type):
     """Numba's type of a vector.
 
     Args:
-        name: Of the type.
+        name: Name of the type in numba's messages and signatures.
         vector: LLVM's type.
     """
 

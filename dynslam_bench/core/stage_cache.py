@@ -81,7 +81,7 @@ class StageCache:
     """A folder of stage results, bounded in size.
 
     Args:
-        folder: Where; created when first written to.
+        folder: Folder of the cache; created when first written to.
         max_bytes: Bound; when it is passed, the least recently used entries are deleted until four
             fifths are left.
     """

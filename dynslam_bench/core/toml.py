@@ -30,7 +30,7 @@ def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[s
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: the file cannot be read or is no TOML; names the place.
+        DynslamError: Raised as `kind`: the file cannot be read or is not TOML; names the place.
     """
     return parse_toml(read_text(path, kind=kind), str(path), kind=kind)
 
@@ -46,8 +46,8 @@ def parse_toml(
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it is no TOML, nested too deeply, or holds a number of
-            thousands of digits.
+        DynslamError: Raised as `kind`: the text is not TOML, is nested too deeply, or holds a
+            number of thousands of digits.
     """
     with translate_errors(
         kind, f"{where} is not valid TOML", of=(ValueError, OverflowError, RecursionError)

@@ -2,7 +2,6 @@
 
 import re
 from functools import cache
-from importlib import metadata
 
 UNKNOWN = "0+unknown"
 """The version of a checkout that is not installed; see `core.fingerprint.git_revision`."""
@@ -11,6 +10,8 @@ UNKNOWN = "0+unknown"
 @cache
 def version() -> str:
     """For example ``0.1.0``, or ``0.1.1.dev5+g1a2b3c4`` five commits after the tag ``v0.1.0``."""
+    from importlib import metadata
+
     try:
         return metadata.version("dynslam-bench")
     except metadata.PackageNotFoundError:

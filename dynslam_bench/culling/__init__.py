@@ -16,11 +16,11 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 
 S = TypeVar("S", bound=Settings)
 Number: TypeAlias = "float | np.number[Any] | np.bool_"
-"""A value of a rule's stats."""
+"""A value of a filter's stats."""
 
 
-class Rule(DynamicFilter, Generic[S]):
-    """A rejection rule; one that keeps something between frames forgets it in its `reset`.
+class BaseFilter(DynamicFilter, Generic[S]):
+    """A filter with settings and stats; one that keeps something between frames forgets it in its `reset`.
 
     Args:
         settings: Its thresholds.
@@ -31,7 +31,7 @@ class Rule(DynamicFilter, Generic[S]):
         self.reset()
 
     def reset(self, camera: Camera | None = None) -> None:
-        """A rule without memory has nothing to reset."""
+        """A filter without memory has nothing to reset."""
 
     def verdict(
         self, keep: NDArray[np.bool_], mask: NDArray[np.bool_] | None = None, /, **stats: Number
@@ -42,8 +42,8 @@ class Rule(DynamicFilter, Generic[S]):
         return FilterResult(keep, keep.astype(np.float32), counts, mask)
 
 
-class ObjectRule(Rule[S]):
-    """A rejection rule that uses segmented objects.
+class ObjectFilter(BaseFilter[S]):
+    """A filter that uses segmented objects.
 
     Args:
         settings: Its thresholds.

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError
 from scipy.stats import chi2
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.ego_motion import PATCH_3X3, depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
@@ -22,7 +22,7 @@ MIXTURE_WEIGHTS = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 """Weights of the 3x3 pixels around a point in the mixture of `depth_variance`."""
 
 
-class CorrelationFilter(Rule[CorrelationSettings]):
+class CorrelationFilter(BaseFilter[CorrelationSettings]):
     """Drops the points outside the largest rigid component of a Delaunay graph.
 
     An edge compares the vector between its two points now with that in the oldest frame, at most
@@ -155,7 +155,8 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
         Args:
             current: World positions and covariances ``[N, 3 + 9]`` of this frame's points.
-            past: Those in the K frames before, newest first, ``[K, N, 3 + 9]``; NaN unobserved.
+            past: World positions and covariances of the same points in the K frames before, newest
+                first, ``[K, N, 3 + 9]``; NaN unobserved.
             observed: bool ``[K, N]``, in which of these each point was observed.
             edges: Pairs of points ``[E, 2]``.
         """

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import ObjectFilter
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
 from dynslam_bench.geometry import at_width, inside
@@ -16,7 +16,7 @@ MIN_POINTS = 3
 """Fewest features with depth in a box for depth RANSAC."""
 
 
-class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
+class DepthRansacFilter(ObjectFilter[DepthRansacSettings]):
     """B6, YOLO-SLAM: in each dynamic box the largest set of features of similar depth is dropped, the rest is kept.
 
     Stats: ``dropped``, ``objects``, ``in_boxes``.
@@ -84,7 +84,7 @@ def person_set(
     return best
 
 
-class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
+class BoxDepthFilter(ObjectFilter[BoxDepthSettings]):
     """NGD-SLAM's masks: drops the features on the largest connected region at the depth of a box's middle.
 
     A box with too little depth, or whose region would cover most of the image, is ignored.
@@ -146,7 +146,7 @@ def _window(
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
+class DepthBlockFilter(ObjectFilter[DepthBlockSettings]):
     """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects they touch.
 
     The depth image is divided into blocks along its edges. A block of which enough lies on the mask

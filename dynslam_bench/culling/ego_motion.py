@@ -1,21 +1,18 @@
-"""The camera's motion since the previous frame from optical flow and depth, and the rigid-motion test that uses it.
+"""The camera's motion since the previous frame, from optical flow and depth.
 
-The test finds motion along epipolar lines, and any motion while the camera only rotates or stands
-still.
+`refine_prediction` is the stage ``ego_motion`` of a frame's timings. The filter that tests points
+against this motion is in `rigid_motion`.
 """
 
-import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
+from dynslam_bench.contracts import FilterState, FrameBundle
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Rule
-from dynslam_bench.culling.settings import RigidMotionSettings
-from dynslam_bench.geometry import Camera, at_width, pixel_index, se3
+from dynslam_bench.culling.moving_regions import cell_index
+from dynslam_bench.geometry import at_width, se3
 from dynslam_bench.geometry.gauss_newton import (
     add_normal_equation,
     apply_twist,
@@ -55,28 +52,6 @@ CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
 (the back end inflates the covariance of its poses for the same reason)."""
 
-THRESHOLD_SHARE = 0.05
-"""Added to the pixel threshold, as a share of the flow that the camera's motion explains (rolling shutter)."""
-MEAN_S = 0.07
-"""Time constant of the mean residual, which finds slow steady motion."""
-MEMORY_S = 1.65
-"""Time constant with which the count of a point's failures decays."""
-NEARBY_PX = 24.0
-"""Points within this distance along both axes, at an image width of 640, share their counts if their depths are
-similar."""
-SIMILAR_DEPTH = 0.1
-"""Depths are similar if they differ by no more than this share."""
-MAX_FAILURES = 2.5
-"""Above this count a point is dropped although it passes now: from the third failure in a row on, and for some seconds
-after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on.
-A whole image that fails in a frame or two, as after a wrong stamp, stays below."""
-
-CELL = 16
-"""Side of the cells in which failing points are counted, pixels at an image width of 640."""
-NEIGHBOURHOOD = (5, 5)
-"""Cells around a point in which it needs company: 80 x 80 px at an image width of 640."""
-MIN_FAILING = 3
-"""Fewest failing points of a moving region."""
 PATCH_3X3 = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 """Offsets of the 3x3 pixels around a pixel, row by row."""
 
@@ -268,7 +243,6 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 
-@kernel
 def _align(
     start: Array,
     points: Array,
@@ -390,212 +364,3 @@ def _linearise(
             dv,
         )
     return hessian, gradient, total
-
-
-class RigidMotionFilter(Rule[RigidMotionSettings]):
-    """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
-
-    A point fails by its residual in this frame, or by the mean of the last few, in which slow
-    motion adds up and noise does not. Points are dropped that fail now, or failed more than
-    `MAX_FAILURES` times before, so that people and objects that pause stay culled. Mean and count
-    decay and follow the flow; points nearby share them at similar depth. Stats: ``dropped``,
-    ``tested``, ``failed`` (in this frame alone).
-    """
-
-    name = "motion"
-    needs: frozenset[Need] = frozenset({"flow", "previous", "prediction", "depth"})
-    stats_names = ("dropped", "tested", "failed")
-
-    def reset(self, camera: Camera | None = None) -> None:
-        """Forget the previous sequence."""
-        # [N, 3] of the previous points: failures, mean residual over its limit
-        self._memory: Array | None = None
-
-    def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
-        """Test the points that have flow and depth."""
-        flow = state.flow
-        xy = frame.keypoints.xy
-        shape = frame.gray.shape
-        if (
-            flow is None
-            or state.previous is None
-            or state.T_world_prev is None
-            or state.T_world_pred is None
-        ):
-            self._memory = None
-            return self.verdict(np.ones(len(xy), dtype=bool))
-
-        # test flow and depth of this frame
-        tested = flow.valid & (frame.z > 0)
-        failed = np.zeros(len(xy), dtype=bool)
-        residual = np.zeros((len(xy), 2))
-        failed[tested], residual[tested], allowed = self._test(frame, state, tested)
-
-        # what is remembered around the points' origins in the previous frame
-        before = np.zeros((len(xy), 3))
-        dt = frame.timestamp - state.previous.timestamp
-        if self._memory is not None:
-            origin = np.where(flow.valid[:, None], flow.xy, xy)
-            before = nearby_mean(
-                state.previous.keypoints.xy,
-                state.previous.z,
-                self._memory,
-                origin,
-                frame.z,
-                at_width(NEARBY_PX, shape[1]),
-            )
-
-        # mean residual over its limit; the mean's noise is this share of one residual's
-        carried = np.exp(-dt / MEAN_S)
-        noise = np.sqrt((1 - carried) / (1 + carried))
-        step = (1 - carried) * residual
-        step[tested] /= (noise * self.settings.threshold_px + allowed)[:, None]
-        # after one bad frame the mean passes
-        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)
-        mean = step + carried * before[:, 1:]
-        failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
-
-        # lone failures are noise; failures are counted, and the count decays
-        failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
-        failures = failed + np.exp(-dt / MEMORY_S) * before[:, 0]
-        self._memory = np.column_stack([failures, mean])
-        keep = ~failed & (failures <= MAX_FAILURES)
-        return self.verdict(keep, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
-
-    def _test(
-        self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
-        assert state.flow is not None
-        assert state.previous is not None
-
-        # flow: distance from where the camera's motion takes the point
-        moved, expected = rigid_flow(frame, state, tested)
-        residual = expected - state.flow_xy[tested]
-        distance = np.linalg.norm(residual, axis=1)
-        allowed = THRESHOLD_SHARE * np.linalg.norm(expected - frame.xy[tested], axis=1)
-
-        # depth: what was measured there must be the point; both measurements are noisy
-        measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
-        limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
-        off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
-        return ~(distance <= self.settings.threshold_px + allowed) | off_depth, residual, allowed
-
-
-@kernel
-def nearby_mean(
-    xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats, nearby_px: float
-) -> Array:
-    """Mean value of the points around each pixel whose depth is similar, so that an object's edge is not averaged away.
-
-    Args:
-        xy: Raw pixels of the points ``[N, 2]``.
-        z: Their depths ``[N]``, metres, 0 missing.
-        values: ``[N, K]``.
-        at: Raw pixels ``[M, 2]``.
-        at_z: Depths there ``[M]``, metres; where 0, points of any depth count.
-        nearby_px: Largest distance along either axis, pixels.
-
-    Returns:
-        Means ``[M, K]``; 0 where there is no such point.
-    """
-    # sorted by rows, so that few points are compared
-    order = np.argsort(xy[:, 1])
-    columns = xy[order, 0].copy()
-    rows = xy[order, 1].copy()
-    depths = z[order]
-    sorted_values = values[order]
-    means = np.zeros((len(at), values.shape[1]))
-    for i in range(len(at)):
-        # the rows that may be near, from the first one on
-        column = at[i, 0]
-        depth = at_z[i]
-        tolerance = SIMILAR_DEPTH * at_z[i]
-        last = at[i, 1] + nearby_px
-        count = 0
-        for k in range(np.searchsorted(rows, at[i, 1] - nearby_px), len(rows)):
-            if rows[k] > last:
-                break
-            # add up those that are near in the image and in depth
-            if abs(columns[k] - column) <= nearby_px and (
-                depth <= 0 or abs(depths[k] - depth) <= tolerance
-            ):
-                for j in range(means.shape[1]):
-                    means[i, j] += sorted_values[k, j]
-                count += 1
-        if count:
-            means[i] /= count
-    return means
-
-
-def nearest_depth(
-    depth: NDArray[np.float32], xy: NDArray[np.floating], expected: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """The depth in the 3x3 patch around each raw pixel that is nearest to the expected depth.
-
-    Thus depth edges and sub-pixel flow errors do not count as motion.
-
-    Args:
-        depth: float32 ``[H, W]`` metres, 0 or not finite where missing.
-        xy: Raw pixels ``[N, 2]``.
-        expected: Depths ``[N]``, metres.
-
-    Returns:
-        Depths ``[N]``, metres; 0 where the patch has none or lies outside the image.
-    """
-    at, visible = pixel_index(np.rint(xy)[:, None] + PATCH_3X3, depth.shape)
-    patch = depth[at].astype(np.float64)
-    patch[~visible | ~np.isfinite(patch)] = 0
-    gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
-    return np.asarray(np.take_along_axis(patch, gap.argmin(axis=1)[:, None], axis=1)[:, 0])
-
-
-# The region rule: in a moving region many points fail, and a lone failure is noise.
-
-
-def cell_index(
-    xy: NDArray[np.floating], size: float, shape: tuple[int, ...]
-) -> tuple[NDArray[np.intp], tuple[int, int]]:
-    """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
-    rows = math.ceil(shape[0] / size)
-    columns = math.ceil(shape[1] / size)
-    cell = np.floor(xy / size).astype(np.intp)
-    return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
-
-
-def _neighbourhood_sum(
-    values: NDArray[np.generic], cell: NDArray[np.intp], grid: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Sum of values ``[N]`` in the neighbourhood of each cell of a grid; cells as in `cell_index`."""
-    total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
-    summed = cv2.boxFilter(
-        total, -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(summed, dtype=np.float64).ravel()
-
-
-def failing_regions(
-    failing: NDArray[np.bool_],
-    tested: NDArray[np.bool_],
-    xy: NDArray[np.floating],
-    share: float,
-    size: tuple[int, ...],
-) -> NDArray[np.bool_]:
-    """The region rule: failing points of whose tested neighbours enough fail too.
-
-    Args:
-        failing: bool ``[N]``, points that failed a test.
-        tested: bool ``[N]``, points that were tested.
-        xy: Raw pixels ``[N, 2]``.
-        share: Share of the tested points in the neighbourhood that must fail; 0 keeps all failures.
-        size: Image height and width.
-
-    Returns:
-        Bool ``[N]``, a subset of `failing`.
-    """
-    if share <= 0 or not failing.any():
-        return failing
-    index, grid = cell_index(xy, at_width(CELL, size[1]), size)
-    failures = _neighbourhood_sum(failing & tested, index, grid)[index]
-    tests = _neighbourhood_sum(tested, index, grid)[index]
-    return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import PATCH_3X3, failing_regions, rigid_flow
+from dynslam_bench.culling import BaseFilter, Number, ObjectFilter
+from dynslam_bench.culling.ego_motion import PATCH_3X3, rigid_flow
+from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -31,7 +32,7 @@ MIN_MATCHES = 16
 CONFIDENCE = 0.99
 """Probability at which RANSAC has drawn a sample without outliers."""
 RIGID_PX = 2.0
-"""A point within this distance of its prediction by the camera's motion counts as static in `contradiction`."""
+"""A point within this distance of its prediction by the camera's motion counts as static in `contradiction_share`."""
 VOTE_SHARE = 0.3
 """Share of an object's tested points that must fail for the object to count as moving (not stated in the paper)."""
 MIN_OUTSIDE = 20
@@ -51,7 +52,8 @@ def fundamental_matrix(
 
     Args:
         x1: Undistorted pixels of the previous image, float64 ``[N, 2]``.
-        x2: Those of the current one that they are matched with, float64 ``[N, 2]``.
+        x2: Undistorted pixels of the current image, float64 ``[N, 2]``; row i is matched with row i
+            of `x1`.
         inlier_px: Distance in pixels up to which a match agrees with F.
         max_draws: Most samples that RANSAC draws.
         min_matches: Fewer matches give no F.
@@ -85,7 +87,7 @@ def epipolar_distance(matrix: NDArray[np.float64], x1: Points, x2: Points) -> Po
     return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
 
 
-class Matches(NamedTuple):
+class FlowMatches(NamedTuple):
     """Keypoints and where their flow ends, undistorted pixels.
 
     Attributes:
@@ -119,7 +121,7 @@ class Matches(NamedTuple):
 
 def matches_by_flow(
     frame: FrameBundle, state: FilterState, unmatched: Unmatched | None = None
-) -> Matches | None:
+) -> FlowMatches | None:
     """The keypoints' matches; None without flow or without a previous frame.
 
     Args:
@@ -137,16 +139,16 @@ def matches_by_flow(
         tested = state.keep & np.isfinite(flow.xy).all(axis=1)
     else:
         tested = state.keep & flow.valid
-    return Matches(state.flow_xy, frame.xy, flow.valid, tested)
+    return FlowMatches(state.flow_xy, frame.xy, flow.valid, tested)
 
 
-class EpipolarFilter(Rule[EpipolarSettings]):
+class EpipolarFilter(BaseFilter[EpipolarSettings]):
     """Drops points, or objects, whose flow leaves the epipolar line.
 
     F is fitted to the flow of the points that earlier filters kept; all points with a valid flow
     are tested. Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``,
     ``homography_share`` (0 where the parallax is too small), ``contradiction`` (see
-    `contradiction`), ``degenerate`` (1 where the test was skipped), ``moving_objects``, ``f_asked``
+    `contradiction_share`), ``degenerate`` (1 where the test was skipped), ``moving_objects``, ``f_asked``
     and ``f_judged`` (see `filter.FilterResult`).
     """
 
@@ -191,7 +193,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
 
         # an F that rejects what follows the camera's motion is not that of the static scene
         if self.settings.max_contradiction < 1:
-            share = stats["contradiction"] = contradiction(frame, state, failing, matches)
+            share = stats["contradiction"] = contradiction_share(frame, state, failing, matches)
             if share > self.settings.max_contradiction:
                 return self.verdict(keep, **stats)
         stats |= {"degenerate": 0, "f_judged": 1}
@@ -200,7 +202,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         if self.settings.mode == "object":
             keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
             return self.verdict(keep, **stats)
-        moving = failing_regions(
+        moving = in_moving_region(
             failing,
             matches.valid,
             frame.keypoints.xy,
@@ -220,7 +222,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         flow_px = float(np.median(np.linalg.norm(x1 - x2, axis=1)))
         if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
-        # a plane
+        # one plane: a homography explains the matches as well, and F is not determined
         share = stats["homography_share"] = homography_share(x1, x2)
         return share > self.settings.homography_share
 
@@ -251,8 +253,8 @@ def homography_share(x1: Points, x2: Points) -> float:
     return 0.0 if matrix is None else float(np.mean(mask))
 
 
-def contradiction(
-    frame: FrameBundle, state: FilterState, failing: Flags, matches: Matches
+def contradiction_share(
+    frame: FrameBundle, state: FilterState, failing: Flags, matches: FlowMatches
 ) -> float:
     """Share of the points that fit the camera's motion in depth and fail the epipolar test.
 
@@ -306,7 +308,7 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
     return keep, moving
 
 
-class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
+class BoxEpipolarFilter(ObjectFilter[BoxEpipolarSettings]):
     """B3 with boxes: drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
 
     Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail
@@ -362,7 +364,7 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
         return self.verdict(keep, f_judged=1, **stats)
 
 
-class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
+class ClassRuleFilter(ObjectFilter[ClassRuleSettings]):
     """B15, class, depth and epipolar line (SEG-SLAM): drops people, and points on movable objects that fail a test.
 
     The setting ``unmatched`` decides about a feature on a movable object whose flow failed.
@@ -447,7 +449,7 @@ VOTE_WINDOW = (22, 22)
 """Window of Lucas-Kanade, pixels."""
 
 
-class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
+class MovingVoteFilter(ObjectFilter[MovingVoteSettings]):
     """DS-SLAM's moving consistency check: corners of its own, pyramidal Lucas-Kanade, F by RANSAC, one global vote.
 
     It has no degeneracy guard; the published system fails on `walking_rpy` without one.

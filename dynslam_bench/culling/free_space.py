@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import depth_sigma, failing_regions
+from dynslam_bench.culling import BaseFilter
+from dynslam_bench.culling.ego_motion import depth_sigma
+from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.settings import FreeSpaceSettings
 from dynslam_bench.geometry import Camera, at_width, pixel_index, se3
 
@@ -25,7 +26,7 @@ PATCH_PX = 3
 and pose errors are no evidence."""
 
 
-class FreeSpaceFilter(Rule[FreeSpaceSettings]):
+class FreeSpaceFilter(BaseFilter[FreeSpaceSettings]):
     """Drops points that violate the free space of several keyframes.
 
     Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least
@@ -90,5 +91,5 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         votes[rows] = violated.sum(axis=0)
         tested[rows] = observed.any(axis=0)
         violating = votes >= min(self.settings.min_votes, len(keyframes))
-        moving = failing_regions(violating, tested, xy, self.settings.min_share, frame.gray.shape)
+        moving = in_moving_region(violating, tested, xy, self.settings.min_share, frame.gray.shape)
         return self.verdict(~moving, asked=len(keyframes), tested=np.count_nonzero(tested))

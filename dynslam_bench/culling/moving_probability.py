@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import ObjectFilter
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
 from dynslam_bench.geometry import Camera, at_width, inside
@@ -24,7 +24,7 @@ RATE = 0.3
 """Weight of the new observation (moving average; our assumption)."""
 
 
-class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
+class ProbabilityFilter(ObjectFilter[ProbabilitySettings]):
     """Drops features whose moving probability exceeds the threshold; the probability follows the flow.
 
     Args:
@@ -125,7 +125,7 @@ def expand(
 
     Args:
         xy: Pixels of all features ``[N, 2]``.
-        probability: Their moving probabilities ``[N]``.
+        probability: Moving probabilities of these features ``[N]``.
         linked: bool ``[N]``, which of them have a history.
         radius_px: Largest distance to that feature; its influence is a Gaussian of half this width.
 

@@ -15,7 +15,7 @@ from dynslam_bench.contracts import (
     Need,
 )
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, Features, as_words, search_in_radius
@@ -37,7 +37,7 @@ MARGIN_PX = 20
 not tested."""
 
 
-class MultiViewFilter(Rule[MultiViewSettings]):
+class MultiViewFilter(BaseFilter[MultiViewSettings]):
     """Drops the features on objects that hide points which earlier keyframes observed.
 
     A region of similar depth grows around every hidden point; features on it and within `border_px`

@@ -4,17 +4,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.fast import EDGE
-from dynslam_bench.features.orb import cell_side, level_quotas, spread
+from dynslam_bench.features.orb import level_quotas, spread
 from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.geometry import feature_scale
 
 ORIGIN = EDGE - 3
 """Where the extractor's cells begin, in pixels of a level."""
 
 
-class ReseedingFilter(Rule[ReseedingSettings]):
+class ReseedingFilter(BaseFilter[ReseedingSettings]):
     """Uses the best `budget` of the features that earlier filters kept.
 
     The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided
@@ -60,7 +61,7 @@ class ReseedingFilter(Rule[ReseedingSettings]):
 
         # from the coarsest level to the finest, each with its quota
         octave = frame.keypoints.octave
-        side = cell_side(self._features, frame.gray.shape[1])
+        scale = feature_scale(frame.gray.shape[1])
         chosen = np.zeros(len(allowed), dtype=bool)
         missing = 0
         levels = max(self._features.levels, int(octave.max()) + 1)
@@ -70,9 +71,9 @@ class ReseedingFilter(Rule[ReseedingSettings]):
             quota = quotas[level] + missing
 
             # cell of each feature in its level
-            at_level = frame.keypoints.xy[rows] / self._features.scale_factor**level
+            at_level = frame.keypoints.xy[rows] / (scale * self._features.scale_factor**level)
             xy = np.rint(at_level - ORIGIN).clip(0)
-            column, row = (xy / side).astype(np.int64).T
+            column, row = (xy / self._features.cell_px).astype(np.int64).T
             cells = row * (column.max(initial=0) + 1) + column
 
             # ranks of the responses, so that equal ones stay equal and keep their order

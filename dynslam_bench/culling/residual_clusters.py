@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.culling import ObjectRule
+from dynslam_bench.culling import ObjectFilter
 from dynslam_bench.culling.settings import ResidualSettings
 from dynslam_bench.geometry import at_width, inside, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import select
@@ -25,7 +25,7 @@ STATIC_PRIOR = 0.05
 """Prior probability that a cluster without people moves."""
 
 
-class ResidualFilter(ObjectRule[ResidualSettings]):
+class ResidualFilter(ObjectFilter[ResidualSettings]):
     """Drops the features on clusters that the camera's motion does not explain.
 
     The residual of a sample is ``|I - I'| / 255 + weight |Z - Z'| / Z`` after warping by the

@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.geometry import inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, dynamic_objects, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
-class SemanticFilter(Rule[SegmentationSettings]):
+class SemanticFilter(BaseFilter[SegmentationSettings]):
     """Drops every keypoint on the dilated masks of the dynamic classes.
 
     Stats: ``dropped``, ``objects`` (of dynamic classes), ``mask_fraction`` (share of the image).

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Number, ObjectRule
+from dynslam_bench.culling import Number, ObjectFilter
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import Camera, se3
@@ -13,7 +13,7 @@ MIN_DEPTH_M = 0.1
 """Points nearer than this to the camera plane are not compared."""
 
 
-class TemplateFilter(ObjectRule[TemplateSettings]):
+class TemplateFilter(ObjectFilter[TemplateSettings]):
     """Drops features in dynamic boxes whose patch does not match at its predicted place in the latest frames.
 
     Stats: ``dropped``, ``in_boxes``, ``tested``, ``median_zncc``.

@@ -70,7 +70,7 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
 
     Args:
         estimate: Associated camera-to-world poses ``[N, 4, 4]``.
-        ground_truth: Their counterparts ``[N, 4, 4]``.
+        ground_truth: True poses ``[N, 4, 4]``, one for each row of `estimate`.
         mode: See `Protocol.alignment`.
 
     Returns:
@@ -96,8 +96,8 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
     centre_target, unit_target, size_target = _centred(target)
     covariance = unit_target.T @ unit_source / len(source)
 
-    # how far the estimate's orientations are turned, summed: decides only what the positions leave
-    # open
+    # how far the estimate's orientations are turned, summed; they decide only what positions on a
+    # line leave open
     orientation = np.tensordot(
         ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))
     ) / len(source)
@@ -190,7 +190,7 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
 
     Args:
         source: Estimated positions in metres ``[N, 3]``, in the order of time.
-        target: Their true counterparts ``[N, 3]``.
+        target: True positions in metres ``[N, 3]``, one for each row of `source`.
         rotation: The rotation found from all of them ``[3, 3]``.
 
     Returns:

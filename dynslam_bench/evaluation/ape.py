@@ -29,7 +29,10 @@ def absolute_errors(estimate: Array, ground_truth: Array) -> tuple[Array, Array]
 def absolute_metrics(comparison: Comparison) -> dict[str, float]:
     """``ate_<statistic>_m`` and ``ape_rot_<statistic>_deg``."""
     translation, rotation = absolute_errors(comparison.aligned, comparison.truth)
-    return {**named("ate", translation, "m"), **named("ape_rot", rotation, "deg")}
+    return {
+        **metrics_with_prefix("ate", translation, "m"),
+        **metrics_with_prefix("ape_rot", rotation, "deg"),
+    }
 
 
 # The seven statistics of an error series.
@@ -55,7 +58,7 @@ def statistics(error: Array) -> dict[str, float]:
     }
 
 
-def named(prefix: str, error: Array, unit: str) -> dict[str, float]:
+def metrics_with_prefix(prefix: str, error: Array, unit: str) -> dict[str, float]:
     """The statistics under their metric names, e.g. ``ate_rmse_m``; the sum of squares has the unit squared."""
     return {
         f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value
@@ -122,7 +125,10 @@ def static_camera(
         raise EvaluationError(f"none of {len(ground_truth)} true poses belongs to an input frame")
     constant = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
     first = np.linalg.norm(positions - positions[0], axis=1)
-    return {**named("constant", constant, "m"), **named("first", first, "m")}
+    return {
+        **metrics_with_prefix("constant", constant, "m"),
+        **metrics_with_prefix("first", first, "m"),
+    }
 
 
 def static_camera_metrics(comparison: Comparison) -> dict[str, float]:

@@ -40,8 +40,8 @@ class Comparison:
         estimate: All poses that take part, also those without ground truth (TUM's relative errors
             need them).
         ground_truth: All true poses, corrected as the protocol has it.
-        estimate_index: Associated poses of the estimate ``[K]``.
-        truth_index: Their counterparts in the ground truth ``[K]``.
+        estimate_index: Rows ``[K]`` of `estimate` that are associated.
+        truth_index: Rows ``[K]`` of `ground_truth` that these are associated with.
         association: What was dropped.
         similarity: The alignment.
         input_timestamps: Stamps in seconds of all input frames; None where they are not known.
@@ -152,7 +152,7 @@ def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
 
 
 class AssociationRecord(Record):
-    """What was compared and what was dropped, as records hold it.
+    """Counts of the compared and the dropped poses, as records hold them.
 
     Attributes:
         n_estimate: Poses of the estimate.

@@ -52,7 +52,7 @@ class Evaluation(Record):
     """The errors of one trajectory, with the protocol that they hold under.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.
         protocol: Its one-line description.
@@ -68,7 +68,8 @@ class Evaluation(Record):
         n_pairs_rpe: Pairs of poses that each relative error is taken over, by its key.
         n_input: Input frames; None where they are not known.
         n_tracked: Input frames with a tracked pose; None where the input frames are not known.
-        coverage: Their ratio.
+        coverage: Share of the input frames with a tracked pose, 0 to 1; None where they are not
+            known.
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
         diagnostics: One line for each fact that the numbers depend on.
@@ -184,7 +185,8 @@ def evaluate_files(
 
     Raises:
         TrajectoryError: A file cannot be read.
-        EvaluationError: As `evaluate`.
+        EvaluationError: Fewer than two poses have ground truth, or the policy for lost frames needs
+            the input frames, see `evaluate`.
     """
     return evaluate_loaded(
         load_trajectory(estimate, timestamps), load_trajectory(ground_truth, timestamps), protocol
@@ -199,7 +201,8 @@ def evaluate_loaded(
     Under evo's association all lines with the same stamp take part, else the last of them.
 
     Raises:
-        EvaluationError: As `evaluate`.
+        EvaluationError: Fewer than two poses have ground truth, or the policy for lost frames needs
+            the input frames, see `evaluate`.
     """
     protocol = get_protocol(protocol)
     repeats = not protocol.one_to_one

@@ -31,7 +31,7 @@ MARGIN = 0.10
 
 
 class GateVerdict(str, Enum):
-    """What a gate says of the candidate's errors."""
+    """A gate's verdict on the candidate's errors."""
 
     IDENTICAL = "identical"
     IMPROVED = "improved"
@@ -40,7 +40,7 @@ class GateVerdict(str, Enum):
     UNDECIDED = "undecided"
 
 
-class Estimate(NamedTuple):
+class GateEstimate(NamedTuple):
     """A mean log ratio with its interval at the level of a look; infinite bounds where there is no scatter to tell."""
 
     centre: float
@@ -65,7 +65,7 @@ def log_ratios(candidate: ArrayLike, baseline: ArrayLike) -> Array:
     return np.asarray(np.clip(ratios, -CLIP, CLIP))
 
 
-def mean_ratio(ratios: ArrayLike, level: float | None = None) -> Estimate:
+def mean_ratio(ratios: ArrayLike, level: float | None = None) -> GateEstimate:
     """The mean over sequences of log ratios ``[S, K]``, with its interval.
 
     Args:
@@ -85,7 +85,7 @@ def mean_ratio(ratios: ArrayLike, level: float | None = None) -> Estimate:
         level = LOOKS[rounds]
     centre = float(values.mean())
     if rounds == 1:
-        return Estimate(centre, -math.inf, math.inf)
+        return GateEstimate(centre, -math.inf, math.inf)
 
     # the error of the mean, from the scatter of the rounds within each sequence
     variances = values.var(axis=1, ddof=1)
@@ -94,11 +94,11 @@ def mean_ratio(ratios: ArrayLike, level: float | None = None) -> Estimate:
     # a few noisy sequences may make up nearly all of it: then it is known as badly as they are few
     free = _degrees_of_freedom(variances, rounds)
     half = float(stats.t.isf(level / 2.0, free)) * error
-    return Estimate(centre, centre - half, centre + half)
+    return GateEstimate(centre, centre - half, centre + half)
 
 
 def _degrees_of_freedom(variances: Array, rounds: int) -> float:
-    """Those of a mean over sequences whose variances ``[S]`` differ (Satterthwaite 1946).
+    """Degrees of freedom of a mean over sequences whose variances ``[S]`` differ (Satterthwaite 1946).
 
     One pooled variance claims falsely in 11.7 % of gates where one of eight sequences scatters, this in
     4.7 %, for one run a sequence more.
@@ -112,7 +112,7 @@ def _degrees_of_freedom(variances: Array, rounds: int) -> float:
 
 
 def decide(
-    estimate: Estimate, lost: tuple[int, int] = (0, 0), margin: float = MARGIN
+    estimate: GateEstimate, lost: tuple[int, int] = (0, 0), margin: float = MARGIN
 ) -> GateVerdict:
     """The verdict at a look.
 

@@ -53,7 +53,7 @@ EXACT_M = 1e-6
 NOISE_M = 1e-5
 """A truth with less noise than this was not measured."""
 MEASURED_S = 1 / 60
-"""Of a truth with longer steps than this, fast motion and noise are not told apart."""
+"""Longest step of a truth in which noise can be told from fast motion, seconds."""
 OTHER_RECORDING_S = 10.0
 """Poses outside of the truth's time, apart from the others by a hole as long, are of another recording; so are those
 behind a step back in time as long."""
@@ -71,7 +71,8 @@ def hints(
     Args:
         estimate: Camera-to-world poses, as they were read.
         ground_truth: True camera-to-world poses at their own stamps; may have holes.
-        protocol: Of it only whether the alignment finds the scale, which then means nothing.
+        protocol: Only its alignment is used: an alignment that finds the scale makes hints on the
+            scale meaningless.
         notes: What the estimate's file held in disorder.
 
     Returns:
@@ -161,8 +162,8 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     track = Track(stamps, poses)
 
-    # places on a grid of lags from which the estimate moves by a known displacement: some of them,
-    # without jumps
+    # places on a grid of lags from which the estimate moves by a known displacement; at most some
+    # 128 of them, and none at a jump
     at = _grid_places(track, step)
     moved = _displacements(track, stamps[0] + step * at, window)
     usable = np.flatnonzero(np.isfinite(moved[:, 0]))
@@ -393,7 +394,7 @@ class Hint:
     """A probable fault of an estimate.
 
     Attributes:
-        id: Which.
+        id: Id of the fault.
         text: One line: what was measured, and the cure.
         numbers: What was measured, by name with its unit.
     """
@@ -456,7 +457,7 @@ class Fit:
     """How well positions can be aligned, from their moments: Umeyama 1991, Eq. 40-43.
 
     Attributes:
-        scale: Of the Sim(3) alignment.
+        scale: Scale of the Sim(3) alignment.
         se3_m: Root mean square error after the SE(3) alignment, metres; exact to 1e-8.
         sim3_m: Root mean square error after the Sim(3) alignment, metres.
         extent_m: Root mean square distance of the true positions from their mean, metres: the error
@@ -617,7 +618,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
     Scales are left out. Of rotations and translations those count that are larger than noise.
 
     Args:
-        motions: Of the estimate, ``[P, 4, 4]``.
+        motions: Relative poses of the estimate ``[P, 4, 4]``, in its own units of length.
         true: The true ones.
         R_est_cam: Rotation from the camera's axes to those that the motions are given in.
 
@@ -662,10 +663,10 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
 
 @dataclass(frozen=True)
 class Convention:
-    """What poses may be in place of camera-to-world matrices.
+    """A convention that poses may follow in place of camera-to-world matrices.
 
     Attributes:
-        id: Of the hint.
+        id: Id of the hint that names this convention.
         what: What they seem to be.
         cure: What was done to them, and what to give instead.
         undo: Brings poses ``[N, 4, 4]`` in order.

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.evaluation.ape import named, statistics
+from dynslam_bench.evaluation.ape import metrics_with_prefix, statistics
 from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
 from dynslam_bench.geometry import (
@@ -57,8 +57,8 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
         over = seconds if spec.rate else 1.0
         translation = np.linalg.norm(errors[:, :3, 3], axis=1) / over
         rotation = np.rad2deg(se3.rotation_angle(errors)) / over
-        metrics |= named(f"rpe_{spec.key}_trans", translation, spec.unit_of("trans"))
-        metrics |= named(f"rpe_{spec.key}_rot", rotation, spec.unit_of("rot"))
+        metrics |= metrics_with_prefix(f"rpe_{spec.key}_trans", translation, spec.unit_of("trans"))
+        metrics |= metrics_with_prefix(f"rpe_{spec.key}_rot", rotation, spec.unit_of("rot"))
     return {
         name: value
         for name, value in metrics.items()

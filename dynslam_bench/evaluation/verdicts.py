@@ -48,12 +48,12 @@ _TIE = 1e-12
 _MANY_TIES = math.sqrt(0.5)
 """Share of ties above which the pseudo-median is one: its square is the share of pairs of ties."""
 _WILCOXON_EFFICIENCY = 3.0 / math.pi
-"""Of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes (Pitman)."""
+"""Pitman's efficiency of the signed-rank test on normal values: it needs 1 / 0.955 times the scenes of the t test."""
 _MOST_SCENES = 100_000
 
 
 class Verdict(str, Enum):
-    """What a comparison says of the candidate."""
+    """A comparison's verdict on the candidate."""
 
     PROVEN = "proven"
     BUT_LOST = "smaller typical error, but lost"
@@ -66,7 +66,7 @@ class Verdict(str, Enum):
 # -- the typical ratio ------------------------------------------------------------------------------
 
 
-class Typical(NamedTuple):
+class PseudoMedian(NamedTuple):
     """A typical log ratio with its interval; the bounds are infinite where there are too few scenes for any."""
 
     centre: float
@@ -74,7 +74,7 @@ class Typical(NamedTuple):
     high: float
 
 
-def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> Typical:
+def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> PseudoMedian:
     """The pseudo-median of log ratios ``[S]``, and the exact interval that the signed-rank test leaves it.
 
     The interval holds all shifts that Wilcoxon's signed-rank test does not reject (Hodges and Lehmann 1963,
@@ -82,7 +82,7 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> Typical:
 
     Args:
         log_ratios: One a scene, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
 
@@ -94,8 +94,8 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> Typical:
     cut = _critical_rank_sum(len(values), round((1.0 - confidence) / 2.0, 12))
     centre = float(np.median(averages))
     if cut == 0:
-        return Typical(centre, -math.inf, math.inf)
-    return Typical(centre, float(averages[cut - 1]), float(averages[-cut]))
+        return PseudoMedian(centre, -math.inf, math.inf)
+    return PseudoMedian(centre, float(averages[cut - 1]), float(averages[-cut]))
 
 
 @lru_cache(maxsize=1024)
@@ -111,12 +111,13 @@ def _critical_rank_sum(count: int, tail: float) -> int:
     return int(np.searchsorted(np.cumsum(probabilities), tail, side="right"))
 
 
-def excluding_interval(log_ratios: ArrayLike, confidence: float = 0.90) -> Typical:
-    """The interval of the typical log ratio by which differences are excluded; infinite bounds exclude none.
+def interval_with_ties(log_ratios: ArrayLike, confidence: float = 0.90) -> PseudoMedian:
+    """Confidence interval of the typical log ratio that stays valid with ties.
 
-    Without ties it is that of `hodges_lehmann`. A setting that rarely acts leaves both errors exactly equal in
-    many scenes. Such ratios do not scatter symmetrically about a typical one that is not 1, which the signed-rank
-    test assumes: with them it excludes falsely in up to 11 %. So where there are ties either of two shows it:
+    It is used to exclude differences; infinite bounds exclude none. Without ties it is that of `hodges_lehmann`.
+    A setting that rarely acts leaves both errors exactly equal in many scenes. Such ratios do not scatter
+    symmetrically about a typical one that is not 1, which the signed-rank test assumes: with them it excludes
+    falsely in up to 11 %. With ties each of two arguments may narrow the interval:
 
     - The other scenes alone (Wilcoxon 1945). Their interval, which holds given the number of ties, is widened to
       contain 0: the typical ratio of all scenes lies between theirs and 1.
@@ -126,11 +127,11 @@ def excluding_interval(log_ratios: ArrayLike, confidence: float = 0.90) -> Typic
 
     Args:
         log_ratios: One a scene ``[S]``, one at least.
-        confidence: Of both sides together.
+        confidence: Probability, both sides together, with which the interval covers the true value.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
-    others = values[np.abs(values) > _TIE]
-    ties = len(values) - len(others)
+    untied = values[np.abs(values) > _TIE]
+    ties = len(values) - len(untied)
     if not ties:
         return hodges_lehmann(values, confidence)
 
@@ -138,15 +139,15 @@ def excluding_interval(log_ratios: ArrayLike, confidence: float = 0.90) -> Typic
     low = -math.inf
     high = math.inf
     centre = 0.0
-    if len(others):
-        centre, low, high = hodges_lehmann(others, confidence)
+    if len(untied):
+        centre, low, high = hodges_lehmann(untied, confidence)
 
     # so many ties that the typical ratio is 1
-    least_share = stats.beta.ppf((1.0 - confidence) / 2.0, ties, len(others) + 1)
+    least_share = stats.beta.ppf((1.0 - confidence) / 2.0, ties, len(untied) + 1)
     if least_share > _MANY_TIES:
         low = max(low, min(centre, 0.0))
         high = min(high, max(centre, 0.0))
-    return Typical(centre, min(low, 0.0), max(high, 0.0))
+    return PseudoMedian(centre, min(low, 0.0), max(high, 0.0))
 
 
 # -- a comparison over scenes -------------------------------------------------------------------------
@@ -174,7 +175,7 @@ class PairedRatio(Record):
         much_better: Scenes where the baseline has more than `CATASTROPHE` times the error.
         lost_both: Scenes that both lost.
         worst: The scene with the largest ratio; empty where `ratio` is None.
-        worst_ratio: That ratio; None likewise.
+        worst_ratio: Ratio of that scene; None where `ratio` is None.
         one_sided: Level of a claim.
         runs: Paired runs behind the scenes.
         lost_runs: How many of them the candidate lost, and the baseline, whether or not that lost a
@@ -321,7 +322,7 @@ def paired_ratio(
     worst = max(paired, key=paired.__getitem__)
     claim = hodges_lehmann(values, 1.0 - 2.0 * one_sided)
     # two one-sided tests of 5 %, whose level a planned look has its share of, too
-    within_90 = excluding_interval(values, 1.0 - 4.0 * one_sided)
+    within_90 = interval_with_ties(values, 1.0 - 4.0 * one_sided)
     within_80 = hodges_lehmann(values, 0.80)
     return PairedRatio(
         ratio=_ratio(claim.centre),
@@ -398,7 +399,7 @@ def findings(
     Args:
         comparison: The candidate beside the baseline.
         subject: What to call the candidate, e.g. ``trial 7``.
-        margin: As `verdict_of` takes it.
+        margin: Differences below this share do not matter.
     """
     verdict = verdict_of(comparison, margin)
     sentences = [_claim(comparison, verdict, subject)]
@@ -566,7 +567,7 @@ def scenes_to_settle(comparison: PairedRatio, margin: float = MARGIN) -> int | N
 
 
 def _scenes_to_exclude_with_ties(comparison: PairedRatio, margin: float, spread: float) -> int:
-    """Scenes that exclude differences where some scenes are ties, see `excluding_interval`."""
+    """Scenes that exclude differences where some scenes are ties, see `interval_with_ties`."""
     paired = scenes_to_exclude(margin, spread)
     if not comparison.ties:
         return paired

@@ -58,7 +58,6 @@ _INT64 = ir.IntType(64)
 _BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
 
 
-@kernel
 def fast_corners(
     image: NDArray[np.uint8], threshold: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
@@ -73,10 +72,26 @@ def fast_corners(
         Indices ``[N]`` into the flat image, and their scores ``[N]``.
     """
     height, width = image.shape
-    pixels = image.reshape(-1)
-    scores = np.zeros(image.size, np.uint8)
-    maxima = np.zeros(image.size, np.uint8)
     circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
+    maxima = np.zeros(image.size, np.uint8)
+    corners = np.empty(image.size // 4, np.int64)
+    count = list_corners(image.reshape(-1), height, width, threshold, circle, maxima, corners)
+    corners = corners[:count]
+    return corners, maxima[corners].astype(np.int16)
+
+
+@kernel
+def list_corners(
+    pixels: NDArray[np.uint8],
+    height: int,
+    width: int,
+    threshold: int,
+    circle: NDArray[np.int64],
+    maxima: NDArray[np.uint8],
+    corners: NDArray[np.int64],
+) -> int:
+    """Fill the scores of the corners of a flat image, 0 elsewhere, and the corners' indices; returns how many."""
+    scores = np.zeros(len(pixels), np.uint8)
     # scores of all rows but those near the upper and lower border
     first = EDGE * width
     last = (height - EDGE) * width
@@ -92,13 +107,11 @@ def fast_corners(
     for at in range(first, last, BYTE_LANES):
         store_maxima(maxima, scores, at, width, threshold)
     # list the maxima, without a branch; of four adjacent pixels one at most is a maximum
-    corners = np.empty(image.size // 4, np.int64)
     count = 0
     for at in range(first, last):
         corners[count] = at
         count += maxima[at] > 0
-    corners = corners[:count]
-    return corners, maxima[corners].astype(np.int16)
+    return count
 
 
 @instruction

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined_statements, kernel
+from dynslam_bench.core.ordering import counting_sort
 
 Words = NDArray[np.uint64]
 
@@ -144,23 +145,13 @@ class CellGrid:
 def _sorted_into_cells(
     xy: NDArray[np.float64], cell: float, columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`CellGrid.start` and `CellGrid.order`, by a counting sort."""
-    # the cell of each point, and the number of points in each cell, one place on
+    """`CellGrid.start` and `CellGrid.order`."""
     cells = np.empty(len(xy), np.int64)
-    start = np.zeros(rows * columns + 1, np.int64)
     for i in range(len(xy)):
         column = min(max(xy[i, 0] // cell, 0), columns - 1)
         row = min(max(xy[i, 1] // cell, 0), rows - 1)
         cells[i] = int(row) * columns + int(column)
-        start[cells[i] + 1] += 1
-    start = np.cumsum(start)
-    # put each point at its cell's next free place
-    order = np.empty(len(xy), np.int64)
-    place = start.copy()
-    for i in range(len(xy)):
-        order[place[cells[i]]] = i
-        place[cells[i]] += 1
-    return start, order
+    return counting_sort(cells, rows * columns)
 
 
 class Features(NamedTuple):
@@ -210,7 +201,7 @@ class _SearchFeatures(NamedTuple):
 
 
 class _SearchTargets(NamedTuple):
-    """What features are searched for.
+    """Positions, search radii and descriptors that features are searched for.
 
     Attributes:
         xy: float64 ``[M, 2]``, expected pixels.

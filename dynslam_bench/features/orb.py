@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.ordering import counting_sort
 from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry import at_width, inside
-from dynslam_bench.geometry.camera import STATED_WIDTH
+from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
@@ -134,7 +134,7 @@ class OrbExtractor:
                 image = np.asarray(
                     cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
                 )
-            levels.append(self._corners(image, scale, cell_side(self.settings, gray.shape[1])))
+            levels.append(self._corners(image, scale))
         return levels
 
     def _choose(
@@ -159,10 +159,11 @@ class OrbExtractor:
             missing += quota - len(chosen[-1])
         return chosen[::-1]
 
-    def _corners(self, image: NDArray[np.uint8], scale: float, cell: int) -> _Level:
-        """A level with its FAST corners, and the cell of the grid, of so many pixels, that each lies in."""
+    def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
+        """A level with its FAST corners, and the cell of the grid that each lies in."""
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
+        cell = self.settings.cell_px
         origin = EDGE - 3
         # cells a row, rounded up
         columns = -(-(image.shape[1] - 2 * origin) // cell)
@@ -190,15 +191,6 @@ class OrbExtractor:
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
 
 
-def cell_side(settings: FeatureSettings, width: int) -> int:
-    """Side of the grid's cells in pixels of each level, of an image of a width.
-
-    Narrow images have smaller cells, not larger ones: a weak corner counts only in a cell without a
-    strong one, and few corners would be left.
-    """
-    return max(1, round(at_width(settings.cell_px, min(width, STATED_WIDTH))))
-
-
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
     """How many features each level gets: in proportion to its side length, `n_features` in all."""
     shares = scale_factor ** -np.arange(levels, dtype=np.float64)
@@ -207,7 +199,6 @@ def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]
     return list(map(int, quotas))
 
 
-@kernel
 def spread(
     cells: NDArray[np.int64], response: NDArray[np.int16], allowed: NDArray[np.bool_], quota: int
 ) -> NDArray[np.int64]:
@@ -226,29 +217,25 @@ def spread(
     index = np.flatnonzero(allowed)
     if len(index) == 0:
         return index
-    # the strongest first; a point's rank is the number of stronger ones in its cell
-    index = index[_stable_order(-response[index])]
-    taken = np.zeros(cells.max() + 1, np.int64)
-    rank = np.empty(len(index), np.int64)
-    for i, cell in enumerate(cells[index]):
-        rank[i] = taken[cell]
-        taken[cell] += 1
-    return index[_stable_order(rank)][: max(quota, 0)]
+    # the strongest first
+    weakness = response.max() - response[index].astype(np.int64)
+    _, order = counting_sort(weakness, int(weakness.max()) + 1)
+    index = index[order]
+    # a point's rank is the number of stronger ones in its cell
+    rank = _occurrences_before(cells[index], int(cells.max()) + 1)
+    _, order = counting_sort(rank, int(rank.max()) + 1)
+    return index[order[: max(quota, 0)]]
 
 
 @kernel
-def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
-    """Indices that sort integers of a small range, by counting; equal ones keep their order."""
-    lowest = keys.min()
-    start = np.zeros(keys.max() - lowest + 2, np.int64)
-    order = np.empty(len(keys), np.int64)
-    for key in keys:
-        start[key - lowest + 1] += 1
-    start = np.cumsum(start)
-    for i, key in enumerate(keys):
-        order[start[key - lowest]] = i
-        start[key - lowest] += 1
-    return order
+def _occurrences_before(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """How often each of the numbers ``[N]``, from 0 to `count` - 1, occurs before it."""
+    occurred = np.zeros(count, np.int64)
+    before = np.empty(len(numbers), np.int64)
+    for i in range(len(numbers)):
+        before[i] = occurred[numbers[i]]
+        occurred[numbers[i]] += 1
+    return before
 
 
 @kernel

@@ -50,8 +50,7 @@ class FeatureSettings(Settings):
         30,
         ge=4,
         le=1000,
-        description="side of the cells over which keypoints are spread, in pixels of each level; smaller in "
-        "proportion where the image is less than 640 pixels wide",
+        description="side of the cells over which keypoints are spread, in pixels of each level",
     )
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of a plug-in extractor, passed as they are"

@@ -536,7 +536,7 @@ def superpixels(
         gray: The image.
         size: Side of the initial squares, pixels.
         compactness: Grey levels that weigh as much as a distance of `size`.
-        iterations: Of k-means.
+        iterations: Iterations of k-means.
     """
     # initial centres (x, y, grey level): those of a grid of squares
     height, width = gray.shape
@@ -619,7 +619,7 @@ def box_mean(
     Args:
         values: float32, flat ``[rows * pitch]``, zero in a frame `radius` wide.
         pitch: Numbers a row.
-        radius: Of the window.
+        radius: Radius of the window, pixels.
         share: float32, flat, one over the pixels in each window, zero in the frame.
         line: float32, flat, scratch, zero in the first and last `radius` rows and in the corners.
         out: float32, flat, filled but for the outermost rows.
@@ -661,7 +661,7 @@ def frame_patch(
         left: First column of the patch.
         height: Rows of the patch.
         width: Columns of the patch.
-        radius: Of the window, pixels.
+        radius: Radius of the window, pixels.
         patch: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, the patch in a frame of
             zeros.
         work: float32 ``[8, ...]``, scratch of at least that length; rows 0 to 2: share, mean and
@@ -706,9 +706,10 @@ def filter_patch(
         patch: float32, flat, the guide of `frame_patch`.
         values: float32, flat, framed as the guide; what is filtered (matching costs).
         pitch: Numbers a row.
-        radius: Of the window, pixels.
+        radius: Radius of the window, pixels.
         epsilon: Regularisation, squared grey levels.
-        work: Of `frame_patch`.
+        work: float32 ``[8, ...]``, the scratch array that `frame_patch` filled; rows 3 to 6 are
+            overwritten.
     """
     n = len(patch)
     share = work[0, :n]
@@ -775,7 +776,7 @@ class PixelMatching(NamedTuple):
 
     Attributes:
         reference: Orientation maps and grey levels of the reference.
-        target: Those of the target.
+        target: Orientation maps and grey levels of the target.
         tables: Tables of the cost, without support.
         descriptors: `DescribedImage.descriptors` of the reference, unrotated.
     """
@@ -791,7 +792,7 @@ class GuidedFilter(NamedTuple):
 
     Attributes:
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
-        radius: Of the windows, half-resolution pixels.
+        radius: Radius of the windows, half-resolution pixels.
         epsilon: float32, regularisation, squared grey levels.
     """
 
@@ -1004,7 +1005,7 @@ def raw_costs(
 
     Args:
         label: Displacement at the centre, and scale times cosine and sine of the rotation.
-        index: Of its scale and rotation.
+        index: Quantised scale and rotation of the label, from 0.
         centre: Full-image pixels.
         patch: Its left and top, width and height, half-resolution pixels.
         radius: Width of the frame around it in `raw`.

@@ -179,7 +179,7 @@ def search_labels(
         matching: Points, target and tables of the matching cost.
         neighbours: int64 ``[N, K]`` of `nearest`.
         guess: float32 ``[N, 2]``, predicted positions; not finite means none.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
 
     Returns:
         The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
@@ -329,7 +329,7 @@ def run_phase(
             finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
         rules: `SearchRules`.
     """
     population = state.costs.shape[1]
@@ -362,7 +362,7 @@ def run_phase(
                 count = finite_labels(candidates[i], trials)
                 if phase == 0 and rules.moth_flame:
                     placed = min(count, population, end - used)
-                    moths[:placed] = trials[:placed]
+                    copy_labels(trials, moths, placed)
             elif stage == INITIAL:
                 random = place_moths(moths, placed, lower, upper, trials, random)
                 count = population - placed
@@ -385,14 +385,14 @@ def run_phase(
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
 
-            # evaluate them
+            # evaluate Eq. 1 for the labels, and keep each that is better than a flame
             for k in range(min(count, end - used)):
                 label = (trials[k, 0], trials[k, 1], trials[k, 2], trials[k, 3])
                 cost = label_cost(i, label, matching, costs[population - 1])
                 insert(flames, costs, trials, k, cost)
                 used += 1
 
-            # the next stage
+            # candidates are followed by the first population, its opposites, then the search itself
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
                 stage = INITIAL if phase == 0 and rules.moth_flame else SEARCH
@@ -402,9 +402,18 @@ def run_phase(
                 # the best N of X and its opposites
                 for m in range(population):
                     if costs[m] < ceiling:
-                        moths[m] = flames[m]
+                        for j in range(4):
+                            moths[m, j] = flames[m, j]
                 stage = SEARCH
         state.used[i] = used
+
+
+@inlined
+def copy_labels(source: Floats, target: Floats, count: int) -> None:
+    """Copy the first `count` labels."""
+    for m in range(count):
+        for j in range(4):
+            target[m, j] = source[m, j]
 
 
 @inlined
@@ -725,7 +734,7 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
         points: float32 ``[N, 2]``.
         labels: float32 ``[N, 4]``.
         costs: int64 ``[N]``; pairs are drawn from the better half.
-        seed: Of the frame.
+        seed: Seed of the frame's random draws.
 
     Returns:
         float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.
@@ -738,8 +747,8 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
     keys = costs * len(costs) + np.arange(len(costs))
     # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
     good = np.sort(np.argpartition(keys, half - 1)[:half])
-    # where the good points lie and where their labels take them, one coordinate after the other for
-    # vector code
+    # where the good points lie and where their labels take them; coordinates are rows, so that the
+    # compiler makes vector code
     tracks = np.concatenate([points[good], points[good] + labels[good, :2]], axis=1).T.copy()
     random = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
     for motion in motions:

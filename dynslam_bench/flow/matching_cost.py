@@ -91,7 +91,7 @@ class MatchingCost(NamedTuple):
     Attributes:
         reference: The points.
         target: The image that they are searched in.
-        tables: Of the image size and the weights.
+        tables: Cost tables for the image size and the weights of Eq. 1, see `cost_tables`.
     """
 
     reference: Reference
@@ -109,7 +109,7 @@ def cost_tables(
         shape: Image height and width in pixels.
         terms: 1 for the descriptors' term alone, 3 for grey level and gradient too.
         support: Number of points around p (1, 5 for a cross, 9 for a square).
-        spacing: Their distance in pixels.
+        spacing: Distance between these points, pixels.
     """
     offsets, ring_level = layout.sampling_table()
     geometry = layout.map_geometry(*shape)
@@ -161,17 +161,19 @@ def truncated_penalty(
 def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
     """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in.
 
-    `level` is a row of `CostTables.ring0` or `ring1`: base, stride, shift, bias.
+    `level` is a row of `CostTables.ring0` or `ring1`: base, stride, shift, bias. A cell is
+    ``2**shift`` quarter pixels wide.
     """
     base = level[0]
     stride = level[1]
     shift = level[2]
     bias = level[3]
-    # quarter pixels, then half cells
+    # the position in quarter pixels, then in half cells
     xq = np.int64(x * np.float32(4) + np.float32(0.5)) + bias
     yq = np.int64(y * np.float32(4) + np.float32(0.5)) + bias
     xh = xq >> (shift - 1)
     yh = yq >> (shift - 1)
+    # the cell, eight bytes each, and the half in which the position lies on either axis
     cell = base + (yh >> 1) * stride + (xh >> 1)
     return 8 * cell, 2 * (yh & 1) + (xh & 1)
 

@@ -116,13 +116,15 @@ def moth_positions(
     """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
 
     Args:
-        moths: Where they are.
-        own: Flames of their own number, which the distance is taken from.
-        flames: The flames they fly around: their own, or the last that is left (Eq. 8).
-        best: The best flame.
-        iteration: Its coefficients.
-        scale: Of the Cauchy steps, per dimension.
-        uniform: Draws.
+        moths: Positions of the moths ``[..., D]``: labels of D dimensions.
+        own: Flames with the moths' own numbers ``[..., D]``; the spiral's width is the distance to
+            them.
+        flames: Flames that the moths fly around ``[..., D]``: their own, or the last flame that is
+            left (Eq. 8).
+        best: The best flame, ``[1, D]`` or ``[D]``.
+        iteration: Coefficients of the iteration.
+        scale: Scale of the Cauchy steps, ``[D]``, in the units of the label.
+        uniform: Draws uniform numbers in [0, 1) of a shape.
     """
     # where on the spiral each moth is drawn, from 1 at the flame to r (Eq. 10)
     t = iteration.span * uniform(moths.shape) + 1
@@ -146,11 +148,12 @@ def opposites(
 
     Args:
         members: Positions ``[..., D]`` of one or several members of the population.
-        least: Lower dynamic bounds of the population (dy of Eq. 20).
-        greatest: Upper dynamic bounds (dz).
-        low: Lower bounds; an opposite outside the bounds is replaced by a draw within them.
-        high: Upper bounds.
-        uniform: Draws.
+        least: Lower dynamic bounds of the population (dy of Eq. 20), ``[..., D]``.
+        greatest: Upper dynamic bounds of the population (dz of Eq. 20), ``[..., D]``.
+        low: Lower bounds of the search ``[D]``; an opposite outside the bounds is replaced by a
+            draw within them.
+        high: Upper bounds of the search ``[D]``.
+        uniform: Draws uniform numbers in [0, 1) of a shape.
     """
     # the opposite of each member in the population's bounds, by one draw a member (Eq. 19)
     opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members

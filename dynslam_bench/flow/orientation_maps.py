@@ -126,8 +126,7 @@ def orientation_maps(
     quarter_rows = max(1, height // 4)
     quarter_columns = max(1, width // 4)
 
-    # the arrays of maps that were deleted, where they have the same size; they keep the zeros of
-    # their margins
+    # take the arrays of deleted maps where they have the same size: their margins are zero already
     shapes = (
         (geometry.total, layout.BINS),
         (height + 2 * BORDER, width + 2 * BORDER),
@@ -338,6 +337,15 @@ def level_reach(blurs: Longs) -> Longs:
 
 
 @inlined
+def farthest_tap(blurs: Longs) -> int:
+    """The largest distance between taps of blurs, int64 ``[L, 2]`` of taps and distance."""
+    farthest = np.int64(0)
+    for level in range(len(blurs)):
+        farthest = max(farthest, blurs[level, 1])
+    return int(farthest)
+
+
+@inlined
 def blur_cascade(
     rings: Halves,
     pitch: int,
@@ -362,11 +370,12 @@ def blur_cascade(
         pitch: Numbers a line.
         row: The newest source row.
         rows: Rows of the levels.
-        columns: Their columns.
+        columns: Columns of the levels.
         top: First row of the stripe.
         bottom: One past its last row.
         blurs: int64 ``[L, 2]``, taps and distance of each level.
-        reach: Of `level_reach`.
+        reach: int64 ``[L + 1]`` of `level_reach`: rows beyond the stripe that each level must
+            compute.
         first_level: Number of the first of these levels.
         geometry: `layout.MapGeometry`.
         margin: Empty histograms around the maps.
@@ -428,7 +437,7 @@ def fine_levels(
     sum_pitch = columns + 2 + SPILL
     # rings of the last rows of each level, a line to blur, and four lines of sums of 2 x 2 pixels
     rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
-    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    line = np.zeros(length + 32 * farthest_tap(blurs) + SPILL, dtype=np.uint16)
     sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
     top = 2 * start
     bottom = min(2 * stop, rows)
@@ -508,7 +517,7 @@ def coarse_levels(
     length = 32 * ((8 * columns + 31) // 32)
     pitch = length + SPILL
     rings = np.zeros((len(blurs) + 1, RING * pitch), dtype=np.uint16)
-    line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
+    line = np.zeros(length + 32 * farthest_tap(blurs) + SPILL, dtype=np.uint16)
     reach = level_reach(blurs)
     for row in range(max(start - reach[0], 0), stop + reach[0]):
         # the source's row into its ring

@@ -111,11 +111,12 @@ class Gradients(NamedTuple):
         levels: Sum of the grey levels.
         x: Sum of the gradients along x.
         y: Sum of the gradients along y.
-        xx: Hessian of the translation, the patch's mean removed.
-        xy: Likewise.
-        yy: Likewise.
-        trace: Of that Hessian.
-        determinant: Of that Hessian.
+        xx: Sum of gx^2 over the window, mean removed; with xy and yy the Hessian of the
+            translation.
+        xy: Sum of gx gy over the window, mean removed: the Hessian's off-diagonal element.
+        yy: Sum of gy^2 over the window, mean removed.
+        trace: Trace of that Hessian.
+        determinant: Determinant of that Hessian.
     """
 
     levels: Scalar
@@ -164,13 +165,13 @@ class Alignment(NamedTuple):
     """Result of the translations within one warp, in pixels of the patch.
 
     Attributes:
-        x: Offset after the last step.
-        y: Likewise.
-        sampled_x: Offset at which the patch was last compared with the template.
-        sampled_y: Likewise.
-        mean: Mean there of the patch, less the template's.
-        residual_x: Sum there of the residuals times the gradients along x.
-        residual_y: Likewise along y.
+        x: Offset along x after the last step.
+        y: Offset along y after the last step.
+        sampled_x: Offset along x at which the patch was last compared with the template.
+        sampled_y: Offset along y at which the patch was last compared with the template.
+        mean: Mean grey level of the patch there, less the template's.
+        residual_x: Sum of the residuals there times the gradients along x.
+        residual_y: Sum of the residuals there times the gradients along y.
         initial: Correlation before the first step.
     """
 
@@ -562,9 +563,9 @@ def align_translation(
 
     Args:
         space: `Workspace` with patch, template and gradients.
-        gradients: Of the template.
+        gradients: Gradients of the template (`template_gradients`).
         template: Its sums.
-        warp: Of the patch.
+        warp: Warp of the patch: where the window lies in the target.
         window: Largest translation, number of steps, tolerance.
         n: Pixels of the window.
         best: Highest correlation so far.

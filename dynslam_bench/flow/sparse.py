@@ -62,7 +62,7 @@ COSTS_PER_CORRELATION = 1000
 """Correlations become whole-number costs in this many steps, to rank points for the common motions."""
 
 
-class Pair(NamedTuple):
+class ImagePair(NamedTuple):
     """Two prepared images, and the tables of their matching cost."""
 
     reference: OrientationMaps
@@ -160,34 +160,41 @@ class SparseDaisyFlow:
         stats = flow_stats(len(xy), int(good.sum()), int(evaluations.sum()))
         return FlowResult(xy, valid, share, stats)
 
-    def pair(self, reference: OrientationMaps, target: OrientationMaps) -> Pair:
+    def pair(self, reference: OrientationMaps, target: OrientationMaps) -> ImagePair:
         """Two images with the tables of the settings' terms and support of Eq. 1."""
         settings = self.settings
         shape = reference.gray.shape
-        return Pair(
+        return ImagePair(
             reference,
             target,
             cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px),
         )
 
-    def matching(self, pair: Pair, points: NDArray[np.float32]) -> MatchingCost:
+    def matching(self, pair: ImagePair, points: NDArray[np.float32]) -> MatchingCost:
         """The matching cost of labels at points ``[N, 2]`` of the reference."""
         described = self.describe(pair.reference, points, pair.tables)
         return MatchingCost(described, image_arrays(pair.target, pair.tables), pair.tables)
 
     def forward_backward_error(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: ImagePair
     ) -> NDArray[np.float32]:
-        """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to."""
+        """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to.
+
+        Args:
+            points: ``[N, 2]``, full-image pixels of the reference.
+            labels: ``[N, 4]``: dx, dy (pixels), log2 of the scale, rotation (radians).
+            pair: The reference and the target.
+        """
         count = len(points)
-        # from the ends, by the inverse label, with one image in the place of the other
+        # back from each end: target and reference swapped. The label's inverse is its negative, and the
+        # kernel refines it in place
         ends = points + labels[:, :2]
         inverse = -labels
         window = Window(1, self.settings.refinement_window_px // 2, margin=BACKWARD_MARGIN, warps=1)
-        correlation = np.empty(count, np.float32)
+        unused_correlation = np.empty(count, np.float32)
         images = (pair.target.framed, pair.reference.framed)
         self.workers.run(
-            similarity_lucas_kanade, 0, count, ends, inverse, *images, window, correlation
+            similarity_lucas_kanade, 0, count, ends, inverse, *images, window, unused_correlation
         )
         error: NDArray[np.float32] = np.hypot(*(ends + inverse[:, :2] - points).T)
         return error
@@ -209,7 +216,7 @@ class SparseDaisyFlow:
         points: NDArray[np.float32],
         labels: NDArray[np.float32],
         neighbours: NDArray[np.int64],
-        pair: Pair,
+        pair: ImagePair,
     ) -> NDArray[np.float32]:
         """Refine labels in place; where neighbours agree on another one, try that. Returns the correlation ``[N]``.
 
@@ -245,7 +252,7 @@ class SparseDaisyFlow:
         correlation: NDArray[np.float32],
         alternative: NDArray[np.float32],
         dissents: NDArray[np.bool_],
-        pair: Pair,
+        pair: ImagePair,
     ) -> None:
         """Replace labels and correlations in place where the alternative, refined, correlates as well.
 
@@ -267,7 +274,7 @@ class SparseDaisyFlow:
         correlation[rows[better]] = other_correlation[better]
 
     def refine(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: ImagePair
     ) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
         # half resolution, then full

@@ -13,7 +13,7 @@ class Workers:
     """Threads over which a kernel's rows or points are divided.
 
     Args:
-        threads: Their number, the calling thread included.
+        threads: Number of threads, the calling thread included.
 
     Attributes:
         run: ``run(kernel, start, stop, *arguments)`` calls ``kernel(start, stop, *arguments)`` on

@@ -63,13 +63,13 @@ class Measurement(Record):
 def measurement_of(
     case: str, number: int, record: RunRecord, store: RunStore, protocol: Any
 ) -> Measurement:
-    """What a gate keeps of a stored run.
+    """The measurement that a gate keeps of a stored run.
 
     Args:
         case: Name of what was run.
-        number: Of the round.
+        number: Number of the round, from 0.
         record: The run.
-        store: Where it is stored.
+        store: Store that holds the run.
         protocol: How it is scored.
     """
     metrics = store.score(record, protocol)
@@ -153,7 +153,7 @@ def _matrix(rows: list[list[float | None]]) -> Array:
 
 
 class Origin(Record):
-    """Which program one side of a gate is.
+    """Origin of the program that one side of a gate runs: name, commit, uncommitted files.
 
     Attributes:
         name: In words: a revision, ``the working tree``, ``the recorded runs``.
@@ -179,16 +179,16 @@ class Baseline(Record):
     """The baseline file.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         question: Digest of the question that it was recorded for.
-        asked: That question, so that a change of it can be named.
+        asked: The question in full, so that a change of it can be named.
         protocol: Id of the protocol of the errors.
         protocol_digest: Its digest.
         code: Digest of the evaluation code.
         origin: Which program was measured.
         recorded: When, UTC, ISO 8601.
         machine: The computer.
-        versions: Of Python and the packages that matter.
+        versions: Versions of Python and the packages that matter.
         runs: The development set.
         confirmation: The confirmation set; empty without one.
         looks: What became known of the confirmation set: one line for each look at it.

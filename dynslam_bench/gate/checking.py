@@ -88,7 +88,7 @@ def init(
     Args:
         path: The file.
         trackers: What is run, see `GateConfig`.
-        sequences: On what; without any on eight rendered scenes.
+        sequences: Sequences that are run; without any eight rendered scenes.
         frames: Part of every sequence.
         build: Command that builds a checkout.
 
@@ -190,7 +190,7 @@ def _in_turns(
 
     Args:
         baseline: One side.
-        candidate: The other one.
+        candidate: The candidate's side.
         cases: What a round runs.
         gate: The question.
         on_run: Told of every run.
@@ -412,8 +412,8 @@ def check(
 
 
 @dataclass
-class _Outcome:
-    """What a gate found, and how.
+class _GateOutcome:
+    """Findings of a gate, and the rounds and runs that they took.
 
     Attributes:
         findings: What both sides show.
@@ -438,12 +438,12 @@ def _checked(
     on_run: OnRun,
     *,
     again: bool,
-) -> _Outcome:
+) -> _GateOutcome:
     """Run the working tree: one round for equality, then in turns with the baseline, or as often as recorded."""
     guarded = gate.config.guardrails
     times_count = guarded.frame_time is not None or guarded.memory is not None
 
-    # equality first
+    # one round first: a change that keeps every trajectory to the bit needs no more
     first = _started(
         stack, "first" if again and times_count else CANDIDATE, gate.folder, gate, place
     )
@@ -451,7 +451,7 @@ def _checked(
     findings = judge(recorded_side, first.side, gate.config, 1, timed=False)
     is_identical = findings.verdict is GateVerdict.IDENTICAL
     if is_identical and not (again and times_count):
-        return _Outcome(findings, 1)
+        return _GateOutcome(findings, 1)
 
     # the recorded runs alone
     if not again:
@@ -469,10 +469,10 @@ def _checked(
     candidate = _started(stack, CANDIDATE, gate.folder, gate, place)
     findings, rounds = _in_turns(baseline, candidate, cases, gate, on_run)
     notes = _notes_on_program(recorded_side, baseline.side)
-    return _Outcome(findings, rounds, reran=True, notes=notes)
+    return _GateOutcome(findings, rounds, reran=True, notes=notes)
 
 
-def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate) -> _Outcome:
+def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate) -> _GateOutcome:
     """The verdict by recorded runs alone, which are looked at once."""
     rounds = min(side.rounds(), candidate.rounds())
     findings = judge(side, candidate, gate.config, rounds, one_look=True, timed=False)
@@ -483,7 +483,7 @@ def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate
         )
     if not recorded.origin.revision or recorded.origin.uncommitted:
         notes.append("the baseline has no revision to be run again: its recorded runs were judged")
-    return _Outcome(findings, rounds, notes=notes)
+    return _GateOutcome(findings, rounds, notes=notes)
 
 
 def _can_run_again(origin: Origin, gate: Gate) -> bool:
@@ -629,7 +629,7 @@ def compare(
         program_a = _started(stack, BASELINE, folder_a, gate, place)
         program_b = _started(stack, CANDIDATE, folder_b, gate, place)
         findings, rounds = _in_turns(program_a, program_b, cases, gate, on_run)
-    outcome = _Outcome(findings, rounds, reran=True)
+    outcome = _GateOutcome(findings, rounds, reran=True)
     result = _result(outcome, gate, origin_a, origin_b, place, notes)
     if confirm:
         if file.is_file():
@@ -646,14 +646,14 @@ def compare(
 
 
 def _result(
-    outcome: _Outcome,
+    outcome: _GateOutcome,
     gate: Gate,
     baseline: Origin,
     candidate: Origin,
     place: Path,
     notes: list[str],
 ) -> GateResult:
-    """What was found, in words and numbers."""
+    """The findings as a `GateResult`, in words and numbers."""
     findings = outcome.findings
     estimate = findings.estimate
     result = GateResult(

@@ -133,7 +133,7 @@ class Gate:
         return self.path.parent
 
     def cases(self, *, confirm: bool = False) -> Cases:
-        """What a round runs, by name.
+        """Run specs of a round, by the name of their case.
 
         Args:
             confirm: The confirmation set in place of the development set.
@@ -258,7 +258,7 @@ def spec_of_round(spec: RunSpec, gate: Gate, number: int) -> RunSpec:
     Args:
         spec: The case.
         gate: Its gate.
-        number: Of the round, from 0.
+        number: Number of the round, from 0.
     """
     update = {"seed": gate.config.seed + number, "offset": spec.offset + number}
     return spec.model_copy(update=update)

@@ -13,7 +13,7 @@ from dynslam_bench.evaluation.gate import (
     CLIP,
     LOOKS,
     ONE_LOOK,
-    Estimate,
+    GateEstimate,
     GateVerdict,
     decide,
     is_lost_more,
@@ -40,17 +40,17 @@ class Findings(NamedTuple):
     """What both sides show after some rounds.
 
     Attributes:
-        verdict: On the error.
+        verdict: Verdict on the error.
         estimate: Mean log ratio with its interval; None where nothing could be compared.
         level: Two-sided level of the interval.
         lost: Runs that the candidate lost, and the baseline.
         cases: Every sequence.
-        guardrails: Those that were asked for.
+        guardrails: Every guardrail that the gate's file names.
         exit_code: See `GateResult`.
     """
 
     verdict: GateVerdict
-    estimate: Estimate | None
+    estimate: GateEstimate | None
     level: float
     lost: tuple[int, int]
     cases: list[CaseResult]
@@ -107,7 +107,7 @@ def judge(
     ratios = log_ratios(errors, errors_baseline)
     estimate = mean_ratio(ratios[is_compared], level) if is_compared.any() else None
 
-    # the verdict
+    # equal trajectories first, then the interval against the margin; more lost runs overrule both
     verdict = GateVerdict.UNDECIDED
     all_lost = lost.all() or lost_baseline.all()
     if are_identical(baseline, candidate, cases, rounds) and not all_lost:
@@ -189,7 +189,7 @@ def _guardrails(
         results.append(_failures(baseline, candidate, rounds, asked.failures))
     if asked.sequence is not None:
         errors = (candidate.errors(cases, rounds), baseline.errors(cases, rounds))
-        results.append(_every_sequence(cases, *errors, asked.sequence))
+        results.append(_worst_sequence(cases, *errors, asked.sequence))
     if asked.frame_time is not None:
         times = (candidate.frame_times(cases, rounds), baseline.frame_times(cases, rounds))
         name = "frame time"
@@ -233,10 +233,17 @@ def _failures(baseline: Side, candidate: Side, rounds: int, limit: int) -> Guard
     return GuardrailResult(name="failures", state=state, limit=limit, measured=measured, text=text)
 
 
-def _every_sequence(
+def _worst_sequence(
     cases: Sequence[str], errors: Array, errors_baseline: Array, limit: float
 ) -> GuardrailResult:
-    """The median ratio of no sequence may be above a limit."""
+    """Guardrail: no sequence's median error ratio (candidate over baseline) may exceed `limit`.
+
+    Args:
+        cases: Names ``[S]``.
+        errors: The candidate's errors, metres ``[S, K]`` of sequences and rounds; nan is a lost run.
+        errors_baseline: The baseline's errors ``[S, K]``.
+        limit: Largest ratio that is allowed.
+    """
     medians = np.median(log_ratios(errors, errors_baseline), axis=1)
     worst = int(medians.argmax())
     measured = math.exp(float(medians[worst]))

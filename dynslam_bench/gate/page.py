@@ -16,7 +16,7 @@ def write_page(result: GateResult, place: Path, baseline: Path, candidate: Path)
         result: What was found.
         place: Where the folder ``page`` is made.
         baseline: Results folder of the baseline's runs.
-        candidate: That of the candidate's.
+        candidate: Results folder of the candidate's runs.
 
     Returns:
         The page; None where a side has no runs here, or nothing can be drawn.

@@ -27,7 +27,7 @@ class CaseResult(Record):
     Attributes:
         case: Its name.
         baseline_m: Median error of the baseline's rounds in metres; None where all were lost.
-        candidate_m: That of the candidate.
+        candidate_m: Median error of the candidate's rounds in metres; None where all were lost.
         ratio: The candidate's typical error over the baseline's, lost runs counted as three times;
             None where both lost all.
         lost_baseline: Rounds that the baseline lost.
@@ -50,7 +50,7 @@ class GuardrailResult(Record):
     """A guardrail beside the error.
 
     Attributes:
-        name: Which.
+        name: Name of the guardrail.
         state: ``held``; ``broken``; ``open``: the scatter is too large to tell; ``not measured``.
         limit: What was allowed.
         measured: What was measured; None where it was not.
@@ -65,11 +65,11 @@ class GuardrailResult(Record):
 
 
 class GateResult(Record):
-    """What a gate found.
+    """Result of a gate: verdict, guardrails and every sequence.
 
     Attributes:
-        schema_version: Of this record.
-        verdict: On the error.
+        schema_version: Version of this record's fields.
+        verdict: Verdict on the error.
         exit_code: 0 passed, 3 runs failed, 4 regressed or a guardrail is broken, 5 undecided.
         sentence: The verdict in words.
         question: Digest of the question.

@@ -24,7 +24,7 @@ _LAST_LINES = 3
 
 
 def git(folder: Path, *arguments: str) -> str:
-    """What git writes about a folder, without white space around it.
+    """The output of a git command in a folder, without white space around it.
 
     Raises:
         RunError: Git is not installed, or refuses.
@@ -96,7 +96,7 @@ def checked_out(folder: Path, revision: str) -> Iterator[Path]:
         revision: The commit.
 
     Yields:
-        The same folder in the checkout.
+        The counterpart of `folder` in the checkout.
 
     Raises:
         RunError: Git cannot check it out, or the revision lacks the folder.
@@ -123,7 +123,7 @@ def build(command: str, folder: Path, name: str) -> None:
 
     Args:
         command: For the shell; empty for none.
-        folder: Where it is run.
+        folder: Folder in which the command runs.
         name: What is built, for messages.
 
     Raises:
@@ -196,6 +196,11 @@ class Runner:
         return str(answer["run_id"])
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Send a request as a line of JSON, and wait for the line of its answer.
+
+        Raises:
+            InfrastructureError: The process has ended.
+        """
         asked = self._process.stdin
         answers = self._process.stdout
         line = ""

@@ -1,7 +1,7 @@
 """Camera model, SE(3), association of stamps, and trajectories with their file formats."""
 
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera, at_width, inside, pixel_index
+from dynslam_bench.geometry.camera import Camera, at_width, feature_scale, inside, pixel_index
 from dynslam_bench.geometry.se3 import Array
 from dynslam_bench.geometry.stamp_units import (
     are_frame_numbers,
@@ -46,6 +46,7 @@ __all__ = [
     "associate",
     "at_width",
     "describe_frame_numbers",
+    "feature_scale",
     "format_ns",
     "format_tum",
     "from_seconds",

@@ -199,6 +199,18 @@ def at_width(size_px: float, width: int) -> float:
     return size_px * width / STATED_WIDTH
 
 
+def feature_scale(width: int) -> float:
+    """Pixels of an image in a pixel of octave 0 of its features; 1 unless the image is narrow.
+
+    Features of an image narrower than `STATED_WIDTH` are extracted from one enlarged to that width.
+    What is known of a feature's position in pixels holds in the enlarged image.
+
+    Args:
+        width: The image's width, pixels.
+    """
+    return at_width(1, min(width, STATED_WIDTH))
+
+
 def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Bool ``[N]``: which raw pixels ``[N, 2]`` lie on the mask ``[H, W]``; pixels outside the image do not."""
     at, visible = pixel_index(xy, mask.shape)

@@ -25,7 +25,7 @@ def transform_point(pose: Array, point: Array) -> tuple[float, float, float]:
 def _add_to_row(
     matrix: Array,
     vector: Array,
-    m: int,
+    m: np.int64,
     weighted: float,
     j0: float,
     j1: float,
@@ -62,13 +62,14 @@ def add_normal_equation(
 
     The derivatives j of the residual by the six numbers of the twist come one by one.
     """
-    # row by row, not in a loop over a tuple, each access to which is a branch in compiled code
-    _add_to_row(matrix, vector, 0, weight * j0, j0, j1, j2, j3, j4, j5, residual)
-    _add_to_row(matrix, vector, 1, weight * j1, j0, j1, j2, j3, j4, j5, residual)
-    _add_to_row(matrix, vector, 2, weight * j2, j0, j1, j2, j3, j4, j5, residual)
-    _add_to_row(matrix, vector, 3, weight * j3, j0, j1, j2, j3, j4, j5, residual)
-    _add_to_row(matrix, vector, 4, weight * j4, j0, j1, j2, j3, j4, j5, residual)
-    _add_to_row(matrix, vector, 5, weight * j5, j0, j1, j2, j3, j4, j5, residual)
+    # row by row, not in a loop over a tuple, each access to which is a branch in compiled code;
+    # for a plain 0, 1, ... numba would compile `_add_to_row` six times
+    _add_to_row(matrix, vector, np.int64(0), weight * j0, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, np.int64(1), weight * j1, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, np.int64(2), weight * j2, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, np.int64(3), weight * j3, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, np.int64(4), weight * j4, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, np.int64(5), weight * j5, j0, j1, j2, j3, j4, j5, residual)
 
 
 @kernel
@@ -130,14 +131,17 @@ def apply_twist(pose: Array, xi: Array) -> Array:
             for m in range(3):
                 k2[i, j] += k[i, m] * k[m, j]
     # exp(xi): rotation I + a k + b k^2, translation (I + b k + c k^2) v.
-    step = np.eye(4)
+    step = np.zeros((4, 4))
+    for i in range(4):
+        step[i, i] = 1.0
     for i in range(3):
         for j in range(3):
             step[i, j] += a * k[i, j] + b * k2[i, j]
             step[i, 3] += (b * k[i, j] + c * k2[i, j]) * xi[j]
         step[i, 3] += xi[i]
     # Applied to the pose from the left.
-    out = np.eye(4)
+    out = np.zeros((4, 4))
+    out[3, 3] = 1.0
     for i in range(3):
         for j in range(4):
             s = step[i, 3] if j == 3 else 0.0
@@ -160,24 +164,42 @@ def apply_twist(pose: Array, xi: Array) -> Array:
     return out
 
 
+@inlined
+def cross(
+    ax: float, ay: float, az: float, bx: float, by: float, bz: float
+) -> tuple[float, float, float]:
+    """Cross product of (ax, ay, az) and (bx, by, bz)."""
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
 @kernel
 def twist_of(pose: Array) -> Array:
     """The twist ``[6]`` (translation, rotation) whose exponential is the pose, rotated by less than half a turn."""
     # The rotation's axis times the sine of its angle, then the angle.
-    out = np.empty(6)
-    out[3] = 0.5 * (pose[2, 1] - pose[1, 2])
-    out[4] = 0.5 * (pose[0, 2] - pose[2, 0])
-    out[5] = 0.5 * (pose[1, 0] - pose[0, 1])
-    sine = np.sqrt(out[3] * out[3] + out[4] * out[4] + out[5] * out[5])
+    rx = 0.5 * (pose[2, 1] - pose[1, 2])
+    ry = 0.5 * (pose[0, 2] - pose[2, 0])
+    rz = 0.5 * (pose[1, 0] - pose[0, 1])
+    sine = np.sqrt(rx * rx + ry * ry + rz * rz)
     theta = np.arctan2(sine, 0.5 * (pose[0, 0] + pose[1, 1] + pose[2, 2] - 1.0))
     if theta < 1e-5:
         factor = 1.0 / 12.0 + theta * theta / 720.0
     else:
-        out[3:] *= theta / sine
+        stretch = theta / sine
+        rx *= stretch
+        ry *= stretch
+        rz *= stretch
         factor = (1.0 - 0.5 * theta / np.tan(0.5 * theta)) / (theta * theta)
     # The inverse of the left Jacobian, applied to the translation.
-    phi = out[3:]
-    t = pose[:3, 3]
-    once = np.cross(phi, t)
-    out[:3] = t - 0.5 * once + factor * np.cross(phi, once)
+    tx = pose[0, 3]
+    ty = pose[1, 3]
+    tz = pose[2, 3]
+    once_x, once_y, once_z = cross(rx, ry, rz, tx, ty, tz)
+    twice_x, twice_y, twice_z = cross(rx, ry, rz, once_x, once_y, once_z)
+    out = np.empty(6)
+    out[0] = tx - 0.5 * once_x + factor * twice_x
+    out[1] = ty - 0.5 * once_y + factor * twice_y
+    out[2] = tz - 0.5 * once_z + factor * twice_z
+    out[3] = rx
+    out[4] = ry
+    out[5] = rz
     return out

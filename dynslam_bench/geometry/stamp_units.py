@@ -75,8 +75,8 @@ class _Measured:
 
     Attributes:
         latest: The largest of them, without signs.
-        usual: Their median, without signs.
-        span: From the first to the last.
+        usual: Median of the stamps, without signs.
+        span: Difference between the first and the last stamp.
         step: Median difference of distinct ones in order of time; None for fewer than two.
     """
 

@@ -61,7 +61,7 @@ def ns_of(seconds: float) -> int:
     """Integer nanoseconds of a float's shortest decimal text: 1305031102.175304 is 1305031102175304000.
 
     Raises:
-        ValueError: As `parse_ns`.
+        ValueError: The number is not finite, or beyond the range of 64 bits (292 years from 0).
     """
     return parse_ns(repr(float(seconds)))
 
@@ -94,7 +94,7 @@ def refuse_close(
         line_of: The line of a stamp in the file; None where it is not known.
 
     Raises:
-        DynslamError: Of the given kind, with the measured gap and the lines.
+        DynslamError: Raised as `kind`, with the measured gap and the lines.
     """
     gaps = np.diff(ns)
     close = np.flatnonzero((gaps > 0) & (gaps < LEAST_GAP_NS))

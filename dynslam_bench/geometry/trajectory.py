@@ -23,8 +23,8 @@ class Trajectory:
     Attributes:
         timestamps: Seconds, float64 ``[N]``, strictly increasing.
         T_world_cam: Camera-to-world poses, float64 ``[N, 4, 4]``.
-        exact_ns: The same stamps in nanoseconds where they are known to more digits than a float
-            holds, int64 ``[N]``; None where the floats are all that is known.
+        exact_ns: The `timestamps` in nanoseconds, int64 ``[N]``, where they are known to more digits
+            than a float holds; None where the floats are all that is known.
     """
 
     timestamps: NDArray[np.float64]

@@ -27,7 +27,7 @@ from dynslam_bench.geometry.stamp_units import SECONDS, SLOWEST_S, StampUnit, me
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
-_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 """What stands in a line of TUM's format."""
 MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
@@ -91,7 +91,7 @@ class FileNotes:
 
 @dataclass(frozen=True, eq=False)
 class TumFile:
-    """A trajectory and the notes on the file it came from.
+    """A trajectory and the notes on the file it came from, TUM's or KITTI's.
 
     Attributes:
         trajectory: The last pose of every stamp.
@@ -116,7 +116,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
     Raises:
-        TrajectoryError: As `load_tum`.
+        TrajectoryError: The file is missing or damaged, or holds no valid pose, see `load_tum`.
     """
     return load_tum(path).trajectory
 
@@ -134,7 +134,7 @@ def load_tum(path: str | Path) -> TumFile:
     heading, line_of_heading = _find_heading(path)
     heading = heading or Heading(8, tuple(range(8)), None)
     table = _read_table(
-        path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0]
+        path, heading.columns, _TUM_COLUMNS, without=line_of_heading, stamp_column=heading.order[0]
     )
 
     # columns in TUM's order; lines without a pose are left out
@@ -176,7 +176,7 @@ def _stamps_of(
 
     Args:
         texts: The stamps as they are written ``[N]``.
-        values: Their numbers.
+        values: The stamps as numbers ``[N]``.
         source: The file.
         stated: The unit that its heading states; None where it states none.
         moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``;
@@ -223,7 +223,7 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
             heading = parse_heading(text)
             commented += [] if heading is None else [heading]
             continue
-        parts = _parts(text)
+        parts = _fields(text)
         if not parts:
             continue
         # the first row, or a heading that is no comment
@@ -231,7 +231,10 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
             return _joined([heading for heading in commented if heading.columns == len(parts)]), 0
         heading = parse_heading(text)
         if heading is None:
-            hint = f"a heading names the stamp, x y z of the position and x y z w of the quaternion, e.g. '{_COLUMNS}'"
+            hint = (
+                "a heading names the stamp, x y z of the position and x y z w of the quaternion, "
+                f"e.g. '{_TUM_COLUMNS}'"
+            )
             if ";" in text:
                 hint = "separate the values by white space or commas, not by semicolons"
             raise TrajectoryError(
@@ -304,7 +307,7 @@ def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
 
     # the heading, with the unit where steps as long as these leave it open
     is_sparse = (median_step(trajectory.timestamps) or 0.0) > SLOWEST_S
-    columns = _COLUMNS
+    columns = _TUM_COLUMNS
     if is_sparse:
         columns = columns.replace("timestamp", f"timestamp [{SECONDS.symbol}]")
     heading = [f"# {line}" for line in (*comment.splitlines(), columns)]
@@ -362,13 +365,13 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             raise TrajectoryError(
                 f"{path} has more than {MOST_LINES} lines, too many for a trajectory"
             )
-        parts = _parts(line)
+        parts = _fields(line)
         if parts:
             yield number, parts
 
 
-def _parts(line: str) -> list[str]:
-    """What stands in a line before a comment, split at commas and spaces."""
+def _fields(line: str) -> list[str]:
+    """The fields of a line, split at commas and spaces; a comment is left out."""
     return line.partition("#")[0].replace(",", " ").split()
 
 
@@ -393,7 +396,8 @@ def _read_table(
     """The rows of a table; `without` is the number of a line that is none of them.
 
     Raises:
-        TrajectoryError: As `read_table`.
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns`
+            numbers.
     """
     values = array("d")
     numbers = list[int]()
@@ -446,7 +450,7 @@ def _hint(parts: list[str]) -> str:
 # Trajectory files of the KITTI odometry benchmark: the 3x4 matrix ``[R|t]`` in row order, twelve
 # numbers a line.
 
-_MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+_KITTI_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 """What stands in a line of KITTI's format."""
 
 
@@ -469,15 +473,15 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
 
 
 def _load_kitti(path: Path, times: Path) -> TumFile:
-    """The trajectory of `read_kitti`, with the notes on both files."""
+    """The camera-to-world trajectory of a KITTI pose file and its stamps, with notes on both."""
     # rigid poses, whose rotations are made orthonormal
-    rows = read_table(path, 12, _MEANING)
+    rows = read_table(path, 12, _KITTI_COLUMNS)
     matrices = rows.reshape(-1, 3, 4)
     poses = se3.from_matrix(matrices[:, :, 3], matrices[:, :, :3])
     for index, pose in enumerate(poses):
         if not se3.is_pose(pose, tolerance=1e-3):
             raise TrajectoryError(
-                f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING
+                f"{path}: pose {index} of {len(poses)} is no rigid transformation", _KITTI_COLUMNS
             )
     poses = se3.with_rotation(poses, nearest_rotation(poses[:, :3, :3]))
 

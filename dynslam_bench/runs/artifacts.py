@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
 from dynslam_bench.core import RunError, TrackerError, read_npz, translate_errors
-from dynslam_bench.envs import FrameOutcome, SlamEnv
+from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
+from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
 from dynslam_bench.geometry import Trajectory, se3
@@ -34,7 +35,7 @@ PICTURE = "frame_{:06d}.webp"
 """Name of the picture of a frame, as its tracker saw it, in the folder of its run."""
 _PICTURE_WIDTH = 400
 _PICTURE_QUALITY = 55
-"""Of the WebP files, 1 to 100."""
+"""Quality of the WebP files, 1 to 100."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +221,8 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], height: int, width: int) -> li
         arrays: ``index``, ``count`` (features of each frame), ``points`` ``[sum(count), 2]`` and
             ``kept`` of all frames, ``masked`` (whether there is a mask) and ``masks``
             ``[frames, height, ceil(width / 8)]``.
-        height: Of the images in pixels.
-        width: Of the images in pixels.
+        height: Height of the images in pixels.
+        width: Width of the images in pixels.
 
     Raises:
         LookupError: An array is missing.

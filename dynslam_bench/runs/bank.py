@@ -39,7 +39,7 @@ from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
-from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, Unreadable, Which
+from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, TrajectoryKind, Unreadable
 from dynslam_bench.runs.record import RunRecord, run_id_of
 from dynslam_bench.runs.store import Merged, RunStore, open_store
 
@@ -66,7 +66,7 @@ class Bank(RunStore):
             RunError: It was removed or changed while it was copied.
         """
         # the sequence's stamps and ground truth, shared by its runs
-        self.copy_part(other, record)
+        self.copy_stamps_and_truth(other, record)
         with self.work_folder(record.run_id) as work:
             # the run's own files, read while nobody changes them
             with self.copying(other, record):
@@ -107,25 +107,25 @@ class StatedTrajectory(Record):
 
     Attributes:
         file: A trajectory in TUM's format: an address, or a path from the manifest's folder.
-        sha256: Of the file.
+        sha256: SHA-256 of the file, 64 hexadecimal digits; empty where it is not known.
         tracker: Name of the system that made it.
         label: Its name in tables.
         sequence: Id of the sequence.
         provenance: Where the file comes from; the address by default.
         which: Whether its poses are the causal ones or those after the final optimisation.
         truth: The ground truth, an address or a path, where the sequence's images are not here.
-        truth_sha256: Of the ground truth.
+        truth_sha256: SHA-256 of the ground truth's file, 64 hexadecimal digits.
     """
 
     model_config = ConfigDict(extra="forbid")
 
     file: str = Field(min_length=1)
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
     tracker: str = Field(min_length=1)
     label: str = ""
     sequence: str = Field(min_length=1)
     provenance: str = ""
-    which: Which = "final"
+    which: TrajectoryKind = "final"
     truth: str = ""
     truth_sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
 

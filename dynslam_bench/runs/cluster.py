@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from dynslam_bench.core import RunError, find_data_root, translate_errors
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.envs import resolve_device
+from dynslam_bench.envs.slam_env import resolve_device
 from dynslam_bench.runs.own_code import package_code
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
@@ -103,7 +103,7 @@ class DaskWorkers(Executor):
         return rows
 
     def _workers(self) -> dict[str, dict[str, Any]]:
-        """What the scheduler knows of each worker, by its address."""
+        """The scheduler's information on each worker, by its address."""
         return self._client.scheduler_info(n_workers=-1)["workers"]  # type: ignore[no-any-return]
 
     def submit(self, make: Callable[..., bytes], spec: str, *arguments: str) -> Future[bytes]:  # type: ignore[override]
@@ -198,7 +198,7 @@ def _answer(
 
 
 def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
-    """What this machine has: code, packages and device, and which sequences and networks it lacks."""
+    """Description of this machine: code, packages and device, and which sequences and networks it lacks."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
     if not cached_checkpoint(COCO):
         lacking.add(f"network {COCO.id}")

@@ -49,7 +49,7 @@ def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) 
             except InfrastructureError:
                 raise
             except DynslamError as error:
-                merged.left_out.append(Unreadable(source.place(run_id), str(error)))
+                merged.left_out.append(Unreadable(source.shown_folder(run_id), str(error)))
                 continue
             newest = max(newest, (record.started, run_id))
     if newest[1]:

@@ -25,7 +25,7 @@ from dynslam_bench.runs.store import RunStore
 if TYPE_CHECKING:
     import pandas as pd
 
-    from dynslam_bench.envs import FrameOutcome
+    from dynslam_bench.envs.episode import FrameOutcome
 
 FRAMES_FILE = "frames.jsonl"
 """The child's log: one line a frame, complete before the next frame begins; gone when the run is stored."""
@@ -55,7 +55,7 @@ _TIME_SUFFIX = "_s"
 
 @validated(frozen=True, config=ConfigDict(extra="forbid"))
 class FrameRow:
-    """What is kept of one frame.
+    """One row of a run's table of frames.
 
     Attributes:
         index: Index of the frame in the run's part of the sequence.
@@ -291,7 +291,7 @@ class FrameLog:
         """Write `frames.csv` and `trajectory_online.txt`.
 
         Args:
-            folder: Where.
+            folder: The folder.
             comment: Head of the trajectory.
             exact: The nanoseconds of the frames' stamps by their seconds, where a float does not
                 hold them.

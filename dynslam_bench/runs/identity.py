@@ -29,28 +29,28 @@ from dynslam_bench.core.module_graph import (
     read_module_graph,
 )
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.reads import Anchors, ImportPath
+from dynslam_bench.core.reads import BaseFolders, ImportPath
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
-from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.wrappers import Degradation
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs.own_code import (
-    anchors_of,
+    base_folders_of,
+    components_of_run,
     is_file,
-    is_foreign,
+    is_outside_package,
     module_of,
-    modules_by_part,
-    named_part,
-    parts_of_run,
+    modules_by_component,
+    portable_name,
 )
 from dynslam_bench.runs.record import ASKED_DIGITS, IDENTITY_SCHEME, StartMap, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import PreprocessingSettings
-from dynslam_bench.sequences.view import Part, part_of, reader_of
+from dynslam_bench.sequences.view import SequencePart, reader_of, sequence_part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
@@ -77,10 +77,10 @@ class ResolvedRun:
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What is asked for, and what is known beforehand of what the run will read.
-        anchors: The folders in which names of files begin that plug-ins and programs read.
-        foreign: Whether plug-ins or programs take part: what they read is known only after the run.
+        base_folders: The folders in which names of files begin that plug-ins and programs read.
+        has_plugins_or_programs: Whether they take part; what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
-        files: Those that the tracker's command names, in the identity by their content.
+        files: Files that the tracker's command names; their content is part of the identity.
     """
 
     spec: RunSpec
@@ -90,19 +90,19 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
-    anchors: Anchors
-    foreign: bool = False
+    base_folders: BaseFolders
+    has_plugins_or_programs: bool = False
     start_map: StartMap | None = None
     files: tuple[Path, ...] = ()
 
     @cached_property
-    def asked(self) -> str:
+    def request_digest(self) -> str:
         """The first twelve digits of its id: what is asked for."""
         return self.run_id[:ASKED_DIGITS]
 
     @cached_property
     def run_id(self) -> str:
-        """Its id; that of a run with foreign parts changes when it is known what they read."""
+        """Its id; that of a run with plug-ins or programs changes when it is known what they read."""
         return run_id_of(self.identity)
 
     @cached_property
@@ -113,7 +113,11 @@ class ResolvedRun:
     @cached_property
     def plugin_packages(self) -> list[str]:
         """The top-level names of the installed modules that take part."""
-        parts = [part for part in self.identity["parts"] if is_foreign(part) and not is_file(part)]
+        parts = [
+            part
+            for part in self.identity["parts"]
+            if is_outside_package(part) and not is_file(part)
+        ]
         return sorted({module_of(part).partition(".")[0] for part in parts})
 
     @property
@@ -161,12 +165,12 @@ class Resolver:
 
     def __init__(self) -> None:
         self._whole = lru_cache(maxsize=None)(open_frames)
-        self._part = lru_cache(maxsize=None)(self._open_part)
+        self._opened_part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
         self._libraries = lru_cache(maxsize=None)(libraries)
         self._configurations: dict[str, _Configuration] = {}
         self._files: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
-        self._parts: dict[tuple[str, str, str, bool], tuple[list[str], Anchors]] = {}
+        self._components: dict[tuple[str, str, str, bool], tuple[list[str], BaseFolders]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up everything that decides a run's result, and name it by digests.
@@ -177,19 +181,20 @@ class Resolver:
         added after its run.
 
         Raises:
-            DynslamError: As `resolve`.
+            DynslamError: A name of the request is not known, or a setting does not fit, see
+                `resolve`.
         """
         spec = spec.absolute()
         configured = self._configuration(spec)
         tracker = configured.tracker
         settings = configured.settings
 
-        # the frames
+        # open the sequence, cut to the frames asked for; refuse what the tracker cannot use
         preprocessing = preprocessing_of(settings)
         if preprocessing is not None and not preprocessing.changes_images:
             preprocessing = None  # trackers with and without such settings share the frames
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing)
-        sequence, part = self._part(where, spec.frames_seen, spec.stride, spec.offset)
+        sequence, part = self._opened_part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
         check_degradation(spec.degrade)
         device = self._device(spec.device)
@@ -201,7 +206,7 @@ class Resolver:
 
         asked = _asked(spec, configured, part, device, start_map)
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
-        parts, anchors = self._named_parts(
+        parts, base_folders = self._named_components(
             configured, source, sequence, changes_frames=changes_frames
         )
 
@@ -227,8 +232,8 @@ class Resolver:
             device=device,
             segmentation=source,
             identity=asked | read,
-            anchors=anchors,
-            foreign=any(map(is_foreign, parts)) or bool(tracker.files),
+            base_folders=base_folders,
+            has_plugins_or_programs=any(map(is_outside_package, parts)) or bool(tracker.files),
             start_map=start_map,
             files=files,
         )
@@ -249,28 +254,28 @@ class Resolver:
             self._files[key] = _files_of(configured.tracker, configured.settings, source)
         return self._files[key]
 
-    def _named_parts(
+    def _named_components(
         self, configured: _Configuration, source: str, sequence: Sequence, *, changes_frames: bool
-    ) -> tuple[list[str], Anchors]:
+    ) -> tuple[list[str], BaseFolders]:
         """What a run is made of, by the names of its identity, and where the names of files begin.
 
         Looked up once for a tracker with its settings, a source of masks and a kind of sequence;
-        see `parts_of_run`.
+        see `components_of_run`.
         """
         reader = reader_of(sequence)
         key = (configured.key, source, reader, changes_frames)
-        if key not in self._parts:
-            entry_points = parts_of_run(
+        if key not in self._components:
+            entry_points = components_of_run(
                 configured.tracker,
                 configured.settings,
                 source,
                 reader,
                 changes_frames=changes_frames,
             )
-            anchors = anchors_of(configured.tracker, entry_points)
-            parts = sorted(named_part(entry, anchors) for entry in entry_points)
-            self._parts[key] = (parts, anchors)
-        return self._parts[key]
+            base_folders = base_folders_of(configured.tracker, entry_points)
+            parts = sorted(portable_name(entry, base_folders) for entry in entry_points)
+            self._components[key] = (parts, base_folders)
+        return self._components[key]
 
     def _open_part(
         self,
@@ -278,13 +283,13 @@ class Resolver:
         frames: tuple[int, int | None] | None,
         stride: int,
         offset: int,
-    ) -> tuple[Sequence, Part]:
+    ) -> tuple[Sequence, SequencePart]:
         """Checked frames of a sequence, and what part of it they are."""
         name, data_root, camera, preprocessing = where
         whole = self._whole(name, data_root, camera, None, 1, preprocessing)
         sequence = open_frames(whole, None, None, frames, stride)
         check_frames(sequence)
-        return sequence, part_of(sequence, offset)
+        return sequence, sequence_part_of(sequence, offset)
 
 
 def check_degradation(strengths: Mapping[str, float]) -> None:
@@ -318,11 +323,11 @@ def _configure(spec: RunSpec, key: str) -> _Configuration:
 def _asked(
     spec: RunSpec,
     configured: _Configuration,
-    part: Part,
+    part: SequencePart,
     device: str,
     start_map: StartMap | None,
 ) -> dict[str, Any]:
-    """What of a run's identity was asked for: the entries `record.ASKED`."""
+    """The request in a run's identity: the entries `record.ASKED`."""
     settings = configured.flat
     if start_map is not None:  # its digest is among the weights
         settings = settings | {MAP_SETTING: ""}
@@ -359,7 +364,7 @@ def _files_of(
     Raises:
         DynslamError: One cannot be read.
     """
-    weights = named_digests(settings, words=is_foreign(tracker.entry_point))
+    weights = named_digests(settings, words=is_outside_package(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
@@ -379,7 +384,7 @@ def libraries() -> dict[str, str]:
 
 
 def source_digests(parts: Iterable[str]) -> dict[str, str]:
-    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
+    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_component`.
 
     Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one
     program made both.
@@ -396,7 +401,7 @@ def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, st
     """The digests that `source_digests` gives, for the modules of one graph."""
     return {
         part: graph.code_digest(modules)[:16]
-        for part, modules in modules_by_part(graph, parts).items()
+        for part, modules in modules_by_component(graph, parts).items()
     }
 
 
@@ -446,9 +451,9 @@ def start_map_of(
 
     Args:
         settings: A tracker's complete settings.
-        camera: Of the sequence, as the tracker sees it.
-        sensors: Of the tracker.
-        digests: Of the files that the settings name, by the setting's name.
+        camera: Intrinsics of the sequence's images, as the tracker sees them.
+        sensors: Sensors that the tracker uses.
+        digests: Digests of the files that the settings name, by the setting's dotted name.
 
     Raises:
         SettingsError: The tracker has features of its own; the file is no map, or one of another

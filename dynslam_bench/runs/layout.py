@@ -24,7 +24,7 @@ STAMPS = "timestamps.txt"
 TRUTH = "groundtruth.txt"
 """Holds the ground truth of a sequence's part."""
 REMOVED_HINT = "if it was removed meanwhile, repeat the command"
-Which = Literal["online", "final"]
+TrajectoryKind = Literal["online", "final"]
 """One of the two trajectories of a run."""
 
 _ID = re.compile(r"[0-9a-f]{16}([0-9a-f]{4})?")

@@ -61,7 +61,7 @@ def list_runs(
             rows[run_id] = run_row(record, metrics)
             entries.append((run_id, state, json.dumps(list(rows[run_id].values()))))
         except DynslamError as error:
-            unreadable.append(Unreadable(store.place(run_id), str(error)))
+            unreadable.append(Unreadable(store.shown_folder(run_id), str(error)))
     store.index.write(name, version, entries)
     return sorted(rows.values(), key=lambda row: (row["started"], row["run_id"])), unreadable
 
@@ -77,7 +77,7 @@ def _parsed_row(run_id: str, text: str) -> Row | None:
 
 @dataclass(frozen=True)
 class Rescored:
-    """What scoring all runs of a store again has changed.
+    """Runs whose metrics changed when all runs of a store were scored again.
 
     Attributes:
         protocol: Id of the protocol.
@@ -138,7 +138,7 @@ def _scorable_runs(store: RunStore) -> tuple[Records, list[Unreadable]]:
             store.check(record)
             readable.append(record.run_id)
         except DynslamError as error:
-            unreadable.append(Unreadable(store.place(record.run_id), str(error)))
+            unreadable.append(Unreadable(store.shown_folder(record.run_id), str(error)))
     return Records(store, readable), unreadable
 
 

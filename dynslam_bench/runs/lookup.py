@@ -30,7 +30,7 @@ class LookUp:
         Of several the newest is taken: a file may have been changed and put back.
         """
         # a run of built-in parts is found by its id alone
-        if not run.foreign and run.run_id in self._stored_ids[run.asked]:
+        if not run.has_plugins_or_programs and run.run_id in self._stored_ids[run.request_digest]:
             record = self._store.get(run.run_id)
             if record is not None and record.identity == run.stated:
                 return record
@@ -48,11 +48,13 @@ class LookUp:
         ]
         if differing:
             return ", ".join(differing)
-        return "" if newest.reads is None else self._verifier.changed(newest.reads, run.anchors)
+        return (
+            "" if newest.reads is None else self._verifier.changed(newest.reads, run.base_folders)
+        )
 
     def _candidates(self, run: ResolvedRun) -> list[RunRecord]:
         """The stored runs of a request, whatever they have read."""
-        records = map(self._store.get, self._stored_ids[run.asked])
+        records = map(self._store.get, self._stored_ids[run.request_digest])
         return [record for record in records if record is not None]
 
     @cached_property
@@ -70,7 +72,7 @@ class LookUp:
         }
         if known_before != run.stated:
             return False
-        if not run.foreign:
+        if not run.has_plugins_or_programs:
             return True
         reads = record.reads
-        return reads is not None and not self._verifier.changed(reads, run.anchors)
+        return reads is not None and not self._verifier.changed(reads, run.base_folders)

@@ -11,7 +11,8 @@ import numpy as np
 
 from dynslam_bench.contracts import MapOutputs
 from dynslam_bench.core import call_periodically
-from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
+from dynslam_bench.envs.slam_env import SlamEnv
+from dynslam_bench.envs.wrappers import DegradeFrames, DropFrames
 from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
 from dynslam_bench.geometry import Trajectory, write_tum
@@ -133,7 +134,7 @@ def _with_changed_frames(slam: SlamEnv, spec: RunSpec) -> gym.Env[Any, Any]:
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
-    """What is known so far: frames, coverage, the protocol's metrics of the frames so far, median frame time."""
+    """Numbers of the run so far: frames, coverage, the protocol's metrics of the frames so far, median frame time."""
     totals = [timing["total"] for timing in env.timings if timing]
     last = env.episode.outcomes[-1].error
     partial: dict[str, Any] = {

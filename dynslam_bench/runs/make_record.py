@@ -25,7 +25,8 @@ from dynslam_bench.runs.record import (
 )
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.sequences.tags import sequence_tags
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.thumbnails import thumbnails
+from dynslam_bench.sequences.view import sequence_part_of
 from dynslam_bench.trackers.registry import resolve_settings
 
 LOST_AT_END = 10
@@ -135,7 +136,7 @@ def make_record(
         overrides=_overrides(resolved, settings),
         settings=settings,
         sequence=sequence_info(
-            resolved.sequence, identity["content"], part_digest(identity), spec.offset
+            resolved.sequence, identity["content"], sequence_part_digest(identity), spec.offset
         ),
         **{name: getattr(spec, name) for name in _FIELDS_OF_SPEC},
         device=resolved.device,
@@ -274,7 +275,7 @@ def recording_notes(sequence: Sequence) -> list[str]:
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:
     """Where a tracker is found that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
-    folder = run.anchors.plugin
+    folder = run.base_folders.plugin
     return {
         "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,
         "folder": "" if folder is None else str(folder),
@@ -283,7 +284,7 @@ def tracker_location(run: ResolvedRun) -> dict[str, str]:
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
     """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
-    input_part = part_of(sequence, offset)
+    input_part = sequence_part_of(sequence, offset)
     stamps = sequence.timestamps
     return SequenceInfo(
         id=sequence.id,
@@ -299,10 +300,11 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
         citation=sequence.citation,
         tags=sequence_tags(sequence),
         split=getattr(sequence, "split", ""),
+        thumbnails=thumbnails(sequence),
     )
 
 
-def part_digest(identity: dict[str, Any]) -> str:
+def sequence_part_digest(identity: dict[str, Any]) -> str:
     """Names what of the sequence a run saw: content and frames."""
     return digest(
         {key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16

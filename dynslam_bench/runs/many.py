@@ -76,7 +76,7 @@ class RunEvent:
 
 @dataclass
 class Plan:
-    """What is to be made.
+    """Runs and frames that a call of `run_many` is to make.
 
     Attributes:
         runs: How many runs.
@@ -174,7 +174,7 @@ class _ManyRuns:
     cancelled: Callable[[], bool]
     on_fault: OnFault | None
     run_ids: list[str] = field(default_factory=list)
-    """Of the runs that were looked up, in their order, as they were known then."""
+    """Ids of the runs that were looked up, in order, as they were known before the runs were made."""
     waiting: list[tuple[ResolvedRun, RunRecord | None]] = field(default_factory=list)
     """Runs that are to be made, each with the record that is stored."""
     done: dict[str, str] = field(default_factory=dict)

@@ -1,6 +1,6 @@
-"""Which modules of this package decide the result of a run: those that its parts import.
+"""Which modules of this package decide the result of a run: those that its components import.
 
-The parts are the tracker's entry point, its filters, features, flow and segmenter, the reader or
+The components are the tracker's entry point, its filters, features, flow and segmenter, the reader or
 renderer of the sequence, and the environment with the run's loop. A change of any other module
 changes no run.
 """
@@ -13,7 +13,7 @@ from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
 from dynslam_bench.core.plugins import Registry
 from dynslam_bench.core.plugins import used as used_plugins
-from dynslam_bench.core.reads import Anchors
+from dynslam_bench.core.reads import BaseFolders
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
@@ -22,14 +22,17 @@ from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.trackers.registry import TRACKERS
-from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings, parts_of
+from dynslam_bench.trackers.systems.composition import (
+    UnfilteredSystemSettings,
+    component_entry_points,
+)
 
-ENVIRONMENT = ("envs.slam_env", "runs.loop")
+ENVIRONMENT_MODULES = ("envs.slam_env", "runs.loop")
 DEGRADED_FRAMES = "envs.wrappers"
 """Needed by runs with degraded or dropped frames alone."""
-FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
+REGISTRY_MODULES = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
-BESIDE_THE_LOOP = (
+RESULT_NEUTRAL_MODULES = (
     "envs.rendering",
     "envs.wrappers",
     "runs.artifacts",
@@ -42,7 +45,7 @@ BESIDE_THE_LOOP = (
     "sequences.decoded",
 )
 """What the environment and the loop use to draw and to store; masks count with the systems that have them."""
-WITH_PLUGINS = (
+PACKAGES_FOR_PLUGINS = (
     "contracts",
     "core",
     "culling",
@@ -60,12 +63,12 @@ WITH_PLUGINS = (
 
 
 ALWAYS_USED = "the environment"
-"""Stands among the parts of a run for the environment with the run's loop."""
+"""Stands among the components of a run for the environment with the run's loop."""
 PLUGINS = "what plug-ins may use"
-"""Stands among the parts of a run with plug-ins for the packages `WITH_PLUGINS`."""
+"""Stands among the components of a run with plug-ins for the packages `PACKAGES_FOR_PLUGINS`."""
 
 
-def parts_of_run(
+def components_of_run(
     tracker: TrackerSpec,
     settings: Settings,
     source: str,
@@ -75,6 +78,8 @@ def parts_of_run(
 ) -> list[str]:
     """What a run is made of beside the environment: entry points, and modules of the sequence, sorted.
 
+    An identity stores them as ``parts``.
+
     Args:
         tracker: The tracker.
         settings: Its complete settings.
@@ -83,48 +88,48 @@ def parts_of_run(
         changes_frames: Whether frames are degraded or dropped.
     """
     # the tracker with its filters, features, flow and masks, and the reader of the sequence
-    parts = {*entry_points_of(tracker, settings, source), reader}
+    components = {*entry_points_of(tracker, settings, source), reader}
     if changes_frames:
-        parts.add(f"{PACKAGE}.{DEGRADED_FRAMES}")
-    return sorted(parts)
+        components.add(f"{PACKAGE}.{DEGRADED_FRAMES}")
+    return sorted(components)
 
 
-def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, list[str]]:
-    """The modules of this package that decide a run's result, by the part of the run that uses them.
+def modules_by_component(graph: ModuleGraph, components: Collection[str]) -> dict[str, list[str]]:
+    """The modules of this package that decide a run's result, by the component of the run that uses them.
 
     Args:
         graph: The package's modules.
-        parts: See `parts_of_run`.
+        components: See `components_of_run`.
 
     Returns:
-        The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a
-        part is foreign.
+        The modules of each component, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a
+        component lies outside this package.
     """
     # what decides no result, and what only looks up the others
-    never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
-    # each part brings what it imports
-    environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
-    beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
+    never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in REGISTRY_MODULES)]
+    # each component brings what it imports
+    environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT_MODULES]
+    beside_the_loop = [f"{PACKAGE}.{name}" for name in RESULT_NEUTRAL_MODULES]
     modules = {ALWAYS_USED: graph.closure(environment, [*never, *beside_the_loop])}
-    for part in parts:
-        modules[part] = graph.closure([module_of(part)], never)
+    for component in components:
+        modules[component] = graph.closure([module_of(component)], never)
     # what a plug-in imports is known only while it runs: all that it may
-    if any(map(is_foreign, parts)):
+    if any(map(is_outside_package, components)):
         modules[PLUGINS] = sorted(modules_for_plugins(graph))
     return modules
 
 
-def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
-    """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
+def modules_of_run(graph: ModuleGraph, components: Collection[str]) -> list[str]:
+    """The modules of this package that decide a run's result, sorted; see `modules_by_component`."""
     used: set[str] = set()
-    for modules in modules_by_part(graph, parts).values():
+    for modules in modules_by_component(graph, components).values():
         used.update(modules)
     return sorted(used)
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
     """The modules of all packages that a plug-in may use."""
-    packages = tuple(f"{PACKAGE}.{name}." for name in WITH_PLUGINS)
+    packages = tuple(f"{PACKAGE}.{name}." for name in PACKAGES_FOR_PLUGINS)
     return [module for module in graph.modules if f"{module}.".startswith(packages)]
 
 
@@ -159,17 +164,17 @@ def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str)
     return used_plugins(names)
 
 
-def module_of(part: str) -> str:
+def module_of(component: str) -> str:
     """The module of an entry point ``module:Attr`` or ``file.py:Attr``; a module's name stays as it is."""
-    return part.rpartition(":")[0] or part
+    return component.rpartition(":")[0] or component
 
 
 def entry_points_of(tracker: TrackerSpec, settings: Settings, source: str) -> Iterator[str]:
     """The entry points of all that a tracker is made of."""
-    # the tracker itself, then its parts
+    # the tracker itself, then its components
     yield tracker.entry_point
     if isinstance(settings, UnfilteredSystemSettings):
-        yield from parts_of(settings)
+        yield from component_entry_points(settings)
     for group in groups_of(settings):
         if isinstance(group, FeatureSettings):
             yield FEATURES.get(group.extractor).entry_point
@@ -193,38 +198,40 @@ def segmenter_of(source: str) -> str:
     return argument if kind == "plugin" else kind
 
 
-def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
+def base_folders_of(tracker: TrackerSpec, components: Iterable[str]) -> BaseFolders:
     """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
 
     A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the
-    part whose file's name comes first.
+    component whose file's name comes first.
 
     Args:
         tracker: The tracker.
-        parts: See `parts_of_run`.
+        components: See `components_of_run`.
     """
-    # files of plug-ins: the tracker's, else those of the parts
+    # files of plug-ins: the tracker's, else those of the components
     if is_file(tracker.entry_point):
         files = [Path(module_of(tracker.entry_point)).absolute()]
     else:
-        files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
+        files = [
+            Path(module_of(component)).absolute() for component in components if is_file(component)
+        ]
     if not files:
-        return Anchors(plugin=None, work=Path.cwd())
+        return BaseFolders(plugin=None, work=Path.cwd())
     # one folder stands for all, and the same one on every machine
     first = min(files, key=lambda file: (file.name, file))
-    return Anchors(plugin=first.parent, work=Path.cwd())
+    return BaseFolders(plugin=first.parent, work=Path.cwd())
 
 
-def named_part(part: str, anchors: Anchors) -> str:
+def portable_name(component: str, base_folders: BaseFolders) -> str:
     """An entry point as it stands in identities: equal wherever the folder of its file lies."""
-    return anchors.name(str(Path(part).absolute())) if is_file(part) else part
+    return base_folders.name(str(Path(component).absolute())) if is_file(component) else component
 
 
-def is_file(part: str) -> bool:
+def is_file(component: str) -> bool:
     """Whether an entry point is in a file that is not installed, ``file.py:Attr``."""
-    return module_of(part).endswith(".py")
+    return module_of(component).endswith(".py")
 
 
-def is_foreign(part: str) -> bool:
-    """Whether a part of a run lies outside this package."""
-    return is_file(part) or module_of(part).partition(".")[0] != PACKAGE
+def is_outside_package(component: str) -> bool:
+    """Whether a component of a run lies outside this package."""
+    return is_file(component) or module_of(component).partition(".")[0] != PACKAGE

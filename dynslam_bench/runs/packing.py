@@ -37,7 +37,7 @@ def expected_identity(run: ResolvedRun) -> dict[str, Any]:
     A plug-in's file counts in the identity as it is read, which is after the run.
     """
     parts = [part for part in run.identity["parts"] if is_file(part)]
-    files = {part: path_digest(Path(run.anchors.path(module_of(part)))) for part in parts}
+    files = {part: path_digest(Path(run.base_folders.path(module_of(part)))) for part in parts}
     return run.stated | {"plug-ins": files}
 
 

@@ -56,7 +56,7 @@ ASKED_DIGITS = 12
 """So many digits of a run's id tell what was asked for."""
 
 
-def asked_digest(identity: Mapping[str, Any]) -> str:
+def digest_of_request(identity: Mapping[str, Any]) -> str:
     """The first twelve digits of a run's id: what was asked for."""
     return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
@@ -65,7 +65,7 @@ def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
     # all that was not asked for was read
     read = {name: value for name, value in identity.items() if name not in ASKED}
-    return asked_digest(identity) + digest(read, 8)
+    return digest_of_request(identity) + digest(read, 8)
 
 
 def coverage_text(coverage: float | None) -> str:
@@ -127,6 +127,7 @@ class SequenceInfo(Record):
         citation: What to cite.
         tags: For example ``high-dynamic``, see `sequences.tags`.
         split: ``tune``, ``held-out`` or empty.
+        thumbnails: Small pictures of a recording before a fixed camera, see `sequences.thumbnails`.
     """
 
     id: str
@@ -142,6 +143,7 @@ class SequenceInfo(Record):
     citation: str = ""
     tags: list[str] = Field(default_factory=list)
     split: str = ""
+    thumbnails: list[str] = Field(default_factory=list)
 
 
 class StageTime(Record):
@@ -156,7 +158,8 @@ class StartMap(Record):
     """The map of an earlier run, in which a run began.
 
     Attributes:
-        digest: Of its content: runs that began in different maps are never repeats of each other.
+        digest: Digest of the map's content: runs that began in different maps are never repeats of
+            each other.
         file: Where it lay.
         made_by: Which run made it, in words.
         keyframes: Keyframes that it brought.
@@ -183,7 +186,7 @@ class RunRecord(Record):
     """The outcome of a run.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
         run_id: Digest of `identity`.
         status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`);
@@ -222,16 +225,16 @@ class RunRecord(Record):
             None for systems without an epipolar test.
         mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks
             of people; None where either is missing.
-        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``)
-            excluded; ``processor`` the processor time of the run's own process in it; ``detector``
-            is a network beside it.
+        timings: Times of the stages, by stage; ``total`` is the frame time: segmentation included,
+            decoding (``read``) excluded; ``processor`` the processor time of the run's own process
+            in it; ``detector`` is a network beside it.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
         wall_s: Wall-clock time of the whole run.
         peak_memory_mb: Largest resident memory.
         peak_gpu_memory_mb: Largest GPU memory, None without one.
         machine: The computer.
-        versions: Of Python and the packages that matter.
+        versions: Versions of Python and the packages that matter.
         git: Revision of the checkout.
         command: The command line of the parent process.
         identity: What `run_id` stands for.
@@ -338,7 +341,7 @@ class RunRecord(Record):
         return self.model_copy(update={"command": [], "place": "", "tracker": tracker})
 
     @property
-    def asked(self) -> dict[str, Any]:
+    def requested_settings(self) -> dict[str, Any]:
         """The settings that were asked for; in place of a map's path the digest of its content, as ``map``.
 
         Values are those that the run had, however they were spelled: ``"1"`` and ``1.0`` are one.
@@ -359,7 +362,7 @@ class RunRecord(Record):
     @property
     def trial_of(self) -> str:
         """The study that made it with settings of its own; empty for its runs with the default settings, and others."""
-        return self.study if self.asked else ""
+        return self.study if self.requested_settings else ""
 
     @property
     def repeat(self) -> str:
@@ -400,7 +403,7 @@ class MetricRecord(Record):
     """The errors of one run under one protocol.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         run_id: The run.
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.

@@ -64,7 +64,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "offset": record.offset,
         "noise": record.sequence.noise,
         "repeat": record.repeat,
-        "settings": "; ".join(assignments(record.asked)),
+        "settings": "; ".join(assignments(record.requested_settings)),
         "status": record.status,
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "static_camera_ate_rmse_m": errors.get("static_camera_ate_rmse_m"),

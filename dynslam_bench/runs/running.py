@@ -32,7 +32,7 @@ from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
 
-WORK = "dynslam_bench.runs.loop:run_loop"
+CHILD_ENTRY_POINT = "dynslam_bench.runs.loop:run_loop"
 """What the child process does; `process.child` imports and calls it."""
 PROGRESS_EVERY = 50
 """Frames between two reports of partial metrics."""
@@ -92,22 +92,22 @@ def run_one(
         partial_results = {key: value for key, value in message.items() if key != "type"}
         return on_progress(resolved.run_id, partial_results)
 
-    with store.work_folder(resolved.run_id) as work:
+    with store.work_folder(resolved.run_id) as work_folder:
         # a child makes the run; it logs each frame in the work folder
-        job = _job(resolved, work, get_protocol(protocol), progress_every)
-        tick = partial(bound_log, work / LOG_FILE, LONGEST_YET)
+        job = _job(resolved, work_folder, get_protocol(protocol), progress_every)
+        tick = partial(bound_log, work_folder / LOG_FILE, LONGEST_YET)
 
         def watch(child: Child) -> ProcessEnd:
             limits = resolved.spec.limits
             return supervise(child, job, limits, report, cancelled, tick=tick, at_a_time=at_a_time)
 
-        end = _watched(work, watch)
-        _check_has_outcome(resolved, end, work)
+        end = _watched(work_folder, watch)
+        _check_has_outcome(resolved, end, work_folder)
 
         # its frames become the files of a stored run
-        frames = _write_frames(resolved, work)
+        frames = _write_frames(resolved, work_folder)
         check_unchanged(resolved, begun=True)
-        reads = read_reads(work) if resolved.foreign else None
+        reads = read_reads(work_folder) if resolved.has_plugins_or_programs else None
         wall_s = time.perf_counter() - clock
         record = make_record(resolved, end, frames, reads, started, wall_s).normalised()
         if record.status != "stopped":
@@ -116,19 +116,21 @@ def run_one(
                 timestamps_ns(resolved.sequence),
                 resolved.sequence.ground_truth,
             )
-            record = store.publish(work, record)
+            record = store.publish(work_folder, record)
     return record
 
 
-def _job(run: ResolvedRun, work: Path, protocol: Protocol, progress_every: int) -> dict[str, Any]:
-    """What the child is told: the run, and how to report partial metrics."""
+def _job(
+    run: ResolvedRun, work_folder: Path, protocol: Protocol, progress_every: int
+) -> dict[str, Any]:
+    """The message to the child: the run, and how to report partial metrics."""
     job = make_job(
-        WORK,
-        work,
+        CHILD_ENTRY_POINT,
+        work_folder,
         spec=run.spec.model_dump(mode="json"),
         protocol=protocol.model_dump(mode="json"),
         progress_every=progress_every,
-        recorded=recorded_parts(run),
+        recorded=recording_options(run),
     )
     # of the listed plug-ins the child imports those that the run names
     plugins = plugins_of_run(run.spec.tracker, run.settings, run.segmentation, run.spec.sequence)
@@ -136,16 +138,16 @@ def _job(run: ResolvedRun, work: Path, protocol: Protocol, progress_every: int) 
     return job
 
 
-def _check_has_outcome(run: ResolvedRun, end: ProcessEnd, work: Path) -> None:
+def _check_has_outcome(run: ResolvedRun, end: ProcessEnd, work_folder: Path) -> None:
     """Check that a run is there and says something about its tracker.
 
     Raises:
         InfrastructureError: Its work folder was removed.
         RunError: What was asked for cannot be, or something else than the tracker's code raised.
     """
-    if not (work / FRAMES_FILE).is_file():
+    if not (work_folder / FRAMES_FILE).is_file():
         raise InfrastructureError(
-            f"{work} was removed while the run was made",
+            f"{work_folder} was removed while the run was made",
             "leave the results folder alone; nothing is stored, the same command goes on from there",
         )
     if end.refused:
@@ -155,7 +157,7 @@ def _check_has_outcome(run: ResolvedRun, end: ProcessEnd, work: Path) -> None:
         )
 
 
-def _write_frames(run: ResolvedRun, work: Path) -> FrameLog:
+def _write_frames(run: ResolvedRun, work_folder: Path) -> FrameLog:
     """Write the table of frames and the online trajectory in place of the child's log of frames.
 
     Returns:
@@ -164,26 +166,28 @@ def _write_frames(run: ResolvedRun, work: Path) -> FrameLog:
     Raises:
         InfrastructureError: They cannot be written.
     """
-    with translate_errors(InfrastructureError, f"cannot write {work}", "the run is not stored"):
-        bound_log(work / LOG_FILE, LONGEST_LOG)
-        frames = FrameLog.read(work / FRAMES_FILE)
+    with translate_errors(
+        InfrastructureError, f"cannot write {work_folder}", "the run is not stored"
+    ):
+        bound_log(work_folder / LOG_FILE, LONGEST_LOG)
+        frames = FrameLog.read(work_folder / FRAMES_FILE)
         title = f"{run.tracker.id} on {run.sequence.id}, seed {run.spec.seed}, online"
-        frames.write(work, title, exact_stamps(run.sequence))
-        (work / FRAMES_FILE).unlink()  # it fails where the folder was removed after all
+        frames.write(work_folder, title, exact_stamps(run.sequence))
+        (work_folder / FRAMES_FILE).unlink()  # it fails where the folder was removed after all
     return frames
 
 
-def recorded_parts(run: ResolvedRun) -> dict[str, Any] | None:
+def recording_options(run: ResolvedRun) -> dict[str, Any] | None:
     """What the child needs to know to record what plug-ins and programs read; None for a run without such."""
-    if not run.foreign:
+    if not run.has_plugins_or_programs:
         return None
-    plugin = None if run.anchors.plugin is None else str(run.anchors.plugin)
-    return {"plugin": plugin, "work": str(run.anchors.work), "packages": run.plugin_packages}
+    plugin = None if run.base_folders.plugin is None else str(run.base_folders.plugin)
+    return {"plugin": plugin, "work": str(run.base_folders.work), "packages": run.plugin_packages}
 
 
-def read_reads(work: Path) -> Reads | None:
+def read_reads(work_folder: Path) -> Reads | None:
     """What the child has recorded, which is taken out of the run's folder; None where it was killed before."""
-    file = work / READS_FILE
+    file = work_folder / READS_FILE
     if not file.is_file():
         return None
     reads = Reads.read(file)
@@ -191,23 +195,23 @@ def read_reads(work: Path) -> Reads | None:
     return reads
 
 
-def _watched(work: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
+def _watched(work_folder: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
     """How a run ended; when its fork server dies, the run is repeated with a fork server of its own.
 
     No other run is there then. If that server dies, too, it is this run that has killed it: the run
     has crashed.
 
     Args:
-        work: Its work folder, which is emptied before each try.
+        work_folder: Its work folder, which is emptied before each try.
         watch: Has a child make the run, and says how it ended.
 
     Raises:
         InfrastructureError: See `supervise`.
     """
-    _empty(work)
+    _empty(work_folder)
     with contextlib.suppress(ServerDiedError):
         return watch(Child())
-    _empty(work)
+    _empty(work_folder)
     with contextlib.closing(ForkServer()) as server_of_run:
         try:
             return watch(Child(server_of_run))
@@ -218,14 +222,16 @@ def _watched(work: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
             return ProcessEnd("crashed", reason)
 
 
-def _empty(work: Path) -> None:
+def _empty(work_folder: Path) -> None:
     """Leave in a work folder an empty log of frames and nothing else."""
     with translate_errors(
-        InfrastructureError, f"cannot write {work}", "check the free space; nothing is stored"
+        InfrastructureError,
+        f"cannot write {work_folder}",
+        "check the free space; nothing is stored",
     ):
-        for path in work.iterdir():
+        for path in work_folder.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)
             else:
                 path.unlink()
-        (work / FRAMES_FILE).touch()
+        (work_folder / FRAMES_FILE).touch()

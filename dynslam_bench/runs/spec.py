@@ -1,4 +1,4 @@
-"""What a run is asked to do."""
+"""The specification of a run: tracker, sequence, frames, settings, device and limits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAP_SETTING = "backend.map.file"
 
 
 class Limits(Record):
-    """What a run may take; no part of its identity.
+    """Limits of a run's time and memory; no part of its identity.
 
     Attributes:
         time_s: Wall-clock time of the whole run; None for no limit.

@@ -48,8 +48,8 @@ from dynslam_bench.runs.layout import (
     RUN_FILE,
     STAMPS,
     TRUTH,
+    TrajectoryKind,
     Unreadable,
-    Which,
     check_plain,
     checked_id,
     file_stamp,
@@ -108,7 +108,7 @@ class RunStore:
         """
         return self.runs / checked_id(run_id, "a run's id")
 
-    def place(self, run_id: str) -> Path:
+    def shown_folder(self, run_id: str) -> Path:
         """Folder of one run as messages name it: below the archive that the store was unpacked from."""
         return self.source / "runs" / run_id
 
@@ -239,7 +239,7 @@ class RunStore:
             InfrastructureError: It cannot be written.
             RunError: It was removed or changed while it was copied.
         """
-        self.copy_part(other, record)
+        self.copy_stamps_and_truth(other, record)
         with self.work_folder(record.run_id) as work:
             with self.copying(other, record):
                 shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
@@ -264,7 +264,7 @@ class RunStore:
             if (other.folder(record.run_id) / RUN_FILE).is_file():
                 raise
             raise RunError(
-                f"{other.place(record.run_id)} was removed while it was copied"
+                f"{other.shown_folder(record.run_id)} was removed while it was copied"
             ) from error
 
     def check_copy(self, work: Path, record: RunRecord) -> None:
@@ -280,7 +280,7 @@ class RunStore:
                     f"{name} of run {record.run_id} was removed or changed while it was copied"
                 )
 
-    def copy_part(self, other: RunStore, record: RunRecord) -> None:
+    def copy_stamps_and_truth(self, other: RunStore, record: RunRecord) -> None:
         """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here.
 
         Raises:
@@ -389,7 +389,7 @@ class RunStore:
             try:
                 started.append((self.read_whole(run_id).started, run_id))
             except DynslamError as error:
-                unreadable.append(Unreadable(self.place(run_id), str(error)))
+                unreadable.append(Unreadable(self.shown_folder(run_id), str(error)))
         return Records(self, [run_id for _, run_id in sorted(started)]), unreadable
 
     def find(self, prefix: str) -> str:
@@ -502,7 +502,7 @@ class RunStore:
 
     def _evaluate(self, record: RunRecord, protocol: Protocol) -> MetricRecord:
         """Evaluate both trajectories of a run, and say why one cannot be evaluated."""
-        evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
+        evaluations: dict[TrajectoryKind, Evaluation | None] = {"online": None, "final": None}
         reasons: dict[str, str] = {}
         hint_lines: list[str] = []
         for which in evaluations:
@@ -526,16 +526,16 @@ class RunStore:
             hints=hint_lines,
         )
 
-    def _scored_trajectory(self, record: RunRecord, protocol: Protocol) -> Which:
+    def _scored_trajectory(self, record: RunRecord, protocol: Protocol) -> TrajectoryKind:
         """The trajectory that the protocol asks for, or the only one that a run has."""
         if record.kind == "imported":
             return "online" if (self.folder(record.run_id) / ONLINE).is_file() else "final"
         return protocol.trajectory if record.tracker.online else "final"
 
     def _inputs(
-        self, record: RunRecord, protocol: Protocol, which: Which
+        self, record: RunRecord, protocol: Protocol, which: TrajectoryKind
     ) -> tuple[Trajectory, Trajectory, NDArray[np.float64] | None]:
-        """What one of a run's trajectories is evaluated with.
+        """Inputs of the evaluation of one of a run's trajectories.
 
         Returns:
             The trajectory, the ground truth, and the stamps of all input frames in seconds; None in
@@ -585,7 +585,7 @@ class RunStore:
                     is_scored = record.status != "stopped"
                     yield record, self.score(record, protocol) if is_scored else None
                 except DynslamError as error:
-                    reasons.append(f"{self.place(run_id)}: {error}")
+                    reasons.append(f"{self.shown_folder(run_id)}: {error}")
 
         frame = runs_frame(scored())
         warn_of_unreadable(reasons)
@@ -698,7 +698,7 @@ def score(
 
 @dataclass(frozen=True)
 class Merged:
-    """What `copying.merge` did.
+    """Runs that `copying.merge` copied, that were stored already, and that it left out.
 
     Attributes:
         added: Ids of the runs that were copied.

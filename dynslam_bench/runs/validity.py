@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.fingerprint import named_digest
 from dynslam_bench.core.libraries import library_identity
-from dynslam_bench.core.reads import Anchors, Reads, Verifier
+from dynslam_bench.core.reads import BaseFolders, Reads, Verifier
 from dynslam_bench.runs.identity import libraries, source_digests
-from dynslam_bench.runs.own_code import is_file, is_foreign, module_of
+from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
@@ -99,7 +99,7 @@ class Installation:
         if file is not None:
             return f"the weights of {file}"
 
-        runs_foreign_code = "files" in program or any(map(is_foreign, parts))
+        runs_foreign_code = "files" in program or any(map(is_outside_package, parts))
         return self._what_was_read(program, plugin) if runs_foreign_code else ""
 
     def _what_was_read(self, program: Mapping[str, Any], plugin: Path | None) -> str:
@@ -108,7 +108,7 @@ class Installation:
             reads = Reads.model_validate(program.get("reads"))
         except ValidationError:
             return NOT_RECORDED
-        return self._verifier.changed(reads, Anchors(plugin=plugin, work=Path.cwd()))
+        return self._verifier.changed(reads, BaseFolders(plugin=plugin, work=Path.cwd()))
 
 
 def _difference(before: object, now: Mapping[str, str]) -> str | None:

@@ -477,7 +477,7 @@ class ConfiguredSegmenter:
         self.settings = settings
         self.source = source
         self.also = also
-        self._foreign: set[str] = set()
+        self._unknown_classes: set[str] = set()
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the frame that count: see `postprocess.select`.
@@ -514,16 +514,16 @@ class ConfiguredSegmenter:
         # class names as the settings write them, then the selection
         names = tuple(canonical_name(str(name)) for name in instances.class_names)
         instances = replace(instances, class_names=names)
-        self._warn_of_foreign(names)
+        self._warn_of_unknown_classes(names)
         return select(instances, self.settings, self.also)
 
-    def _warn_of_foreign(self, names: Iterable[str]) -> None:
+    def _warn_of_unknown_classes(self, names: Iterable[str]) -> None:
         """Warn once of each name of a plug-in's that is neither COCO's nor asked for."""
         if not self.source.startswith("plugin:"):
             return
-        expected = self.settings.class_names().union(self.also, COCO_NAMES, self._foreign)
+        expected = self.settings.class_names().union(self.also, COCO_NAMES, self._unknown_classes)
         for name in sorted(set(names) - expected):
-            self._foreign.add(name)
+            self._unknown_classes.add(name)
             warnings.warn(
                 f"{self.source} found '{name}', which is no COCO class and not among segmentation.classes "
                 f"({self.settings.classes}): its objects are not masked",

@@ -106,7 +106,7 @@ def repair(
 
 def fill_holes(mask: NDArray[np.bool_], radius: int = HOLE_RADIUS_PX) -> NDArray[np.bool_]:
     """Close gaps of up to `radius` pixels and fill the background that the mask encloses."""
-    # morphological closing
+    # close gaps; a margin keeps the element inside the image
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(mask, radius + 1).view(np.uint8)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, element)

@@ -16,7 +16,7 @@ from dynslam_bench.segmentation.recorded import CLASSES_FILE, read_classes
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 ORIGIN_FILE = "recorded.json"
-"""Beside the masks: the sequence and the settings that they were made of."""
+"""Lies beside the masks, and holds the sequence and the settings that they were made of."""
 
 
 def record_masks(

@@ -23,7 +23,7 @@ from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name
 
 CLASSES_FILE = "classes.json"
-"""Beside the masks: the class name of each number."""
+"""Lies beside the masks, and holds the class name of each number."""
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
 MISSPELLED = 0.8
@@ -156,7 +156,7 @@ class RecordedSegmenter:
         return missing
 
     def _keys_of(self, timestamps: NDArray[np.float64]) -> list[float]:
-        """What frames are looked up by: their stamps in seconds, or their indices."""
+        """Keys by which frames are looked up: their stamps in seconds, or their indices."""
         return timestamps.tolist() if self.by_stamp else list(range(len(timestamps)))
 
     def _nearest(self, key: float) -> tuple[int, float]:

@@ -97,7 +97,7 @@ class MaskScheduler:
 
     Attributes:
         segmented: Whether the segmenter ran on the latest frame.
-        beside_s: Seconds that it took beside tracking for the masks that the latest frame took.
+        async_segmenter_s: Seconds that it took beside tracking for the masks that the latest frame took.
     """
 
     def __init__(self, settings: SegmentationSettings, segmenter: Segmenter) -> None:
@@ -112,22 +112,22 @@ class MaskScheduler:
         """Put other settings with the same source into force."""
         self._settings = settings
         if settings.schedule != "async":
-            self.settle()
+            self.wait_for_segmenter()
         self._missed.limit = settings.compensate
         if isinstance(self.segmenter, ConfiguredSegmenter):
             self.segmenter.settings = settings
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the masks of the previous sequence."""
-        self.settle()
+        self.wait_for_segmenter()
         self._missed.reset()
         self._instances = Instances.empty(0, 0)
         self._gray = np.zeros((0, 0), np.uint8)
         self._age = 0
         self.segmented = False
-        self.beside_s = 0.0
+        self.async_segmenter_s = 0.0
 
-    def settle(self) -> None:
+    def wait_for_segmenter(self) -> None:
         """Wait for the segmenter, which works on one frame at a time, and forget its answer; warn of its error."""
         request = self._request
         self._request = None
@@ -144,7 +144,7 @@ class MaskScheduler:
                 keyframe, when lost.
         """
         first = self._gray.shape != gray.shape
-        self.beside_s = 0.0
+        self.async_segmenter_s = 0.0
         if self._settings.schedule == "async" and not first:
             self.segmented = self._take(frame, gray)
         elif first or self._due(keyframe):
@@ -178,7 +178,7 @@ class MaskScheduler:
         if request is not None and taken:
             # an error is raised once
             self._request = None
-            instances, self.beside_s = request.answer.result()
+            instances, self.async_segmenter_s = request.answer.result()
             self._instances = carry_dense(
                 self._missed.update(instances, request.since), request.flow
             )
@@ -240,7 +240,7 @@ class _Track:
         box: float32 ``[4]``, x0, y0, x1, y1, pixels.
         mask: bool ``[H, W]``.
         name: Its class.
-        score: Of its last detection.
+        score: Score of its last detection, 0 to 1.
         velocity: float32 ``[4]``, change of the box, pixels a frame.
         hits: How often it was detected.
         missed: Segmented frames in a row without a detection of it.

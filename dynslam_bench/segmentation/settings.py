@@ -210,7 +210,7 @@ def check_classes(
 
     Args:
         known: The names of its classes, without the background.
-        settings: Their `classes` are the dynamic ones.
+        settings: Settings whose `classes` are the dynamic ones.
         where: The source's file, folder or sequence, for the error.
         whose: What the classes are of, e.g. ``the network``.
 
@@ -284,7 +284,7 @@ AT_640 = "px at width 640"
 
 
 class SegmentationSettings(Settings):
-    """Which pixels are dynamic because of what they show.
+    """Settings of the semantic stage: which pixels are dynamic because of what they show.
 
     `dilation_px` is the *radius* of the structuring element at an image width of 640 pixels, and
     is scaled with the width: 15 grows a mask by 15 pixels on every side (an element of 31 x 31

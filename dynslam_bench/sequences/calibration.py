@@ -316,7 +316,7 @@ def _half_size_grey(sequence: Sequence, index: int) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class CalibrationEstimate:
     """A value with its 95 % interval over windows.
 
     Attributes:
@@ -333,7 +333,7 @@ class Estimate:
         return self.half <= max(RESOLVED_S, RESOLVED_SHARE * abs(self.value))
 
 
-def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
+def adjust(windows: list[Window]) -> tuple[CalibrationEstimate, CalibrationEstimate]:
     """Adjust all windows together with the readout time and the delay of depth that they share.
 
     Args:
@@ -386,7 +386,7 @@ def _coarse_delay(windows: list[Window]) -> float:
 
 def _over_windows(
     windows: list[Window], values: Array, information: Array, systematic: float = SYSTEMATIC_S
-) -> Estimate:
+) -> CalibrationEstimate:
     """Mean of the windows' values, each with its own and the windows' common variance, and half the 95 % interval.
 
     A random-effects mean (DerSimonian and Laird, 1986) with the interval of Hartung and Knapp
@@ -399,7 +399,7 @@ def _over_windows(
     spare = information.sum() - (information**2).sum() / information.sum()
     between = max(0.0, (q - (k - 1)) / max(spare, 1e-12))
 
-    # random effects
+    # mean of the windows, weighted by the variance within and between them (random effects)
     weights = 1 / (1 / np.maximum(information, 1e-12) + between)
     mean = float((values * weights).sum() / weights.sum())
     scatter = float((weights * (values - mean) ** 2).sum() / ((k - 1) * weights.sum()))
@@ -410,13 +410,15 @@ def _over_windows(
     overlapping = float((np.diff(starts) < length).mean())
     variance = max(scatter, float(1 / weights.sum())) * (1 + overlapping)
     statistical = student.ppf(0.975, k - 1) * np.sqrt(variance)
-    return Estimate(mean, float(np.hypot(statistical, 1.96 * systematic)))
+    return CalibrationEstimate(mean, float(np.hypot(statistical, 1.96 * systematic)))
 
 
 # What an estimate means for the camera's file.
 
 
-def _readout_quantity(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
+def _readout_quantity(
+    estimate: CalibrationEstimate, windows: list[Window], camera: Camera
+) -> Quantity:
     """The readout time; what is written is never longer than the time between two frames."""
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
     longest = np.floor(1e4 * interval_s) / 1e4
@@ -459,7 +461,7 @@ def _slow_turning(windows: list[Window]) -> str:
     return f"the turning rate changes by {change:.2f} rad/s within a window; turn the camera to and fro faster"
 
 
-def _delay_quantity(estimate: Estimate, camera: Camera) -> Quantity:
+def _delay_quantity(estimate: CalibrationEstimate, camera: Camera) -> Quantity:
     """The delay of the depth images; the stamps that the reader gives have the camera's own delay added already."""
     value = estimate.value
     half = estimate.half
@@ -480,7 +482,7 @@ def _delay_quantity(estimate: Estimate, camera: Camera) -> Quantity:
     return replace(quantity, written=round(own + value, 4), reason=reason)
 
 
-def _too_wide(estimate: Estimate, why: str) -> str:
+def _too_wide(estimate: CalibrationEstimate, why: str) -> str:
     return f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: {why}"
 
 

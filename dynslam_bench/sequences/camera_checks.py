@@ -116,7 +116,7 @@ def camera_findings(
             if explained_share(used, turned, camera) > explained_share(used, relative, camera):
                 return [finding]
 
-    # the depth factor
+    # the depth factor, from the scale of the images' translations beside the truth's
     first_guess = float(np.exp(-fits.groups["scale"].value["scale"][0]))
     share = _depth_share(used)
     if share < _LEAST_DEPTH:

@@ -21,7 +21,7 @@ class Fit:
             and ``cy`` as pixels to be added, ``turn`` the rotation vector ``[3]`` in rad and
             ``lever`` the position ``[3]`` in metres of the camera in the frame of the body that the
             truth tracks.
-        sigma: Their standard deviations, each pair of frames being one observation.
+        sigma: Standard deviations of these values, each pair of frames being one observation.
         residual_px: Median reprojection error.
         cost: Mean robust cost of a corner.
     """

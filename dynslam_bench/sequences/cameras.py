@@ -311,7 +311,12 @@ def camera_by_name(folder: Path) -> str | None:
 
 
 def camera_of(
-    folder: Path, contents: Contents, chosen: ChosenCamera | None, catalogued: str = ""
+    folder: Path,
+    contents: Contents,
+    chosen: ChosenCamera | None,
+    catalogued: str = "",
+    *,
+    lacks_rate: bool = False,
 ) -> Camera:
     """The camera of a folder, complete and plausible: what was chosen, else what files say, else what the name implies.
 
@@ -324,6 +329,8 @@ def camera_of(
         contents: What its reader found in it.
         chosen: What the user chose.
         catalogued: Name of the camera that the catalogue states; empty where it does not.
+        lacks_rate: Whether nothing states a frame rate that the images need: the camera file of the
+            error asks for it.
 
     Returns:
         The camera. Its `R_body_cam` is the rotation that the ground truth needs, None where it
@@ -352,7 +359,7 @@ def camera_of(
                 f"a published camera: --camera {'|'.join(CAMERAS)}",
                 f"another one: --camera FILE.toml, or that file as {CAMERA_FILE} in the folder",
             ),
-            template=_template(folder, contents, None),
+            template=_template(folder, contents, None, lacks_rate=lacks_rate),
         )
 
     # what belongs to the recording and not to the lens
@@ -405,7 +412,12 @@ def _median_raw_depth(folder: Path, contents: Contents) -> float | None:
 
 
 def _template(
-    folder: Path, contents: Contents, chosen: ChosenCamera | None, camera: Camera | None = None
+    folder: Path,
+    contents: Contents,
+    chosen: ChosenCamera | None,
+    camera: Camera | None = None,
+    *,
+    lacks_rate: bool = False,
 ) -> str:
     """A ``camera.toml`` that is complete but for what nobody knows: left empty, with a remark what belongs there."""
     # what the images, the chosen file and the camera tell
@@ -447,7 +459,10 @@ def _template(
             remark += f": the first image's median is {median / factor:.3g} m"
         lines.append(_template_line(f"# depth_factor = {factor}", remark))
     rate = chosen.fps if chosen is not None else contents.fps
-    lines += [] if rate is None else [f"fps = {rate}"]
+    if lacks_rate:
+        lines.append(_template_line("fps =", "images a second: their names are numbers"))
+    elif rate is not None:
+        lines.append(f"fps = {rate}")
     return "\n".join(lines)
 
 

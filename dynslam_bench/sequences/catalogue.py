@@ -23,7 +23,14 @@ from dynslam_bench.core import (
 from dynslam_bench.core.plugins import Registry, described, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry import Camera
-from dynslam_bench.sequences.cameras import CAMERA_FILE, CAMERAS, camera_of, chosen_camera
+from dynslam_bench.sequences.cameras import (
+    CAMERA_FILE,
+    CAMERAS,
+    camera_by_name,
+    camera_of,
+    chosen_camera,
+)
+from dynslam_bench.sequences.readers.files import NoRateError
 from dynslam_bench.sequences.readers.layouts import (
     find_layout,
     is_bag,
@@ -188,7 +195,7 @@ def open_sequence(
         SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path
             and the command that fetches it), damaged, or no frame in the part asked for.
     """
-    # the whole sequence
+    # open all frames of the sequence
     settings = preprocessing or PreprocessingSettings()
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
@@ -272,7 +279,13 @@ def open_folder(
     layout = find_layout(folder, catalogued)
     chosen = chosen_camera(folder, camera)
     fps = (chosen.fps if chosen else None) or (entry.fps if entry else None)
-    contents = layout.read(folder, fps)
+    try:
+        contents = layout.read(folder, fps)
+    except NoRateError:
+        # without a camera, too, one file states both: any rate reads the images that it is made from
+        if chosen is None:
+            camera_of(folder, layout.read(folder, 30.0), None, lacks_rate=True)
+        raise
     notes = layout_notes(folder, layout, catalogued)
     if camera is not None and (folder / CAMERA_FILE).exists():
         notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
@@ -287,6 +300,9 @@ def open_folder(
             "tags": frozenset(entry.tags),
             "split": entry.split,
         }
+    # what says the camera, in the order in which it is looked for
+    named = entry.camera if entry else camera_by_name(folder)
+    source = f"the folder's name ({named})" if contents.camera is None else "the folder's files"
     return RecordedSequence(
         folder,
         contents,
@@ -294,6 +310,8 @@ def open_folder(
         **about,
         fps=contents.fps or fps,
         notes=notes,
+        layout=layout.name,
+        camera_source=source if chosen is None else chosen.source,
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
     )
@@ -327,7 +345,7 @@ def _open_whole(
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
 
-    # a folder
+    # the name is that of a folder, of a bag, or unknown
     if is_bag(path):
         raise SequenceError(
             f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"
@@ -396,7 +414,12 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         data_root: Folder of the sequences.
 
     Returns:
-        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always
+        One dictionary a sequence: its ``id``, whether it is ``here`` on this machine (rendered ones
+        always are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
+        ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout``
+        says whether the reader was ``verified`` on the publisher's files or ``not verified``;
+        ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before
+        it is fetched, None for what is rendered.
         are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
         ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout`` says
         whether the reader was ``verified`` on the publisher's files or ``not verified``;

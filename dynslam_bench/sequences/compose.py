@@ -54,7 +54,7 @@ _PLACES = 12
 _SAMPLED = 6
 """Frames on which each place is tried."""
 _REDUCED = 4
-"""By how much the images of these frames are reduced."""
+"""Factor by which the images of these frames are reduced."""
 _DISTANCES_M = 0.8, 1.5
 """Distance of the person in the host's first image, metres."""
 _SCALES = 1.0, 0.75, 0.6, 0.45
@@ -70,7 +70,7 @@ _GAP_S = 0.1
 
 # How a person is drawn.
 _UPSAMPLED = 4
-"""By how much a cutout's resolution is increased before its points are drawn."""
+"""Factor by which a cutout's resolution is increased before its points are drawn."""
 _EDGE_M = 0.1
 """Neighbouring pixels of a person whose depths differ by more are parts of the body before each other."""
 _SHADOW_BASELINE_M = 0.075
@@ -467,8 +467,8 @@ class _Actor:
 
         Args:
             index: The frame.
-            camera: Of the image.
-            upsampled: By how much the cutout's resolution is increased.
+            camera: Intrinsics of the host's image.
+            upsampled: Factor by which the cutout's resolution is increased.
         """
         # Points of the earlier cutout, moved towards the later one.
         at = self.played[index]
@@ -566,7 +566,7 @@ def paste(
         depth: Its depth in metres ``[H, W]``, 0 where there is none: it is taken for that of the
             nearest measurement.
         colour: The people's colours ``[H, W, 3]``.
-        z: Their depth in metres ``[H, W]``, 0 where nobody is.
+        z: The people's depth in metres ``[H, W]``, 0 where nobody is.
         camera: The host's.
 
     Returns:

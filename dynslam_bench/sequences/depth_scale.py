@@ -86,7 +86,7 @@ def depth_scale(
         pairs: Pairs of frames whose rotations agree with the truth's.
         truth: The ground truth.
         start: Stamps ``[N]`` of the pairs' first frames, on the truth's clock.
-        end: Those of the second frames.
+        end: Stamps ``[N]`` of the pairs' second frames, on the truth's clock.
         camera: The stated camera.
         first_guess: A scale near which the translations are looked for.
 

@@ -76,7 +76,7 @@ class Verification:
 
     Attributes:
         id: The sequence.
-        folder: Where it lies.
+        folder: Folder in which it lies.
         frames: Frames that were decoded.
         faults: One line a fault; empty if all is sound.
         manifest: Whether every file was compared with the checksum taken when it was fetched.

@@ -52,10 +52,10 @@ class ImageStatistics:
         medians: Median depth of each frame that has any, metres.
         colour_run: Most equal colour images in a row.
         depth_run: Most equal depth images in a row.
-        roughness: Of some frames, the mean step between neighbouring raw depths relative to the
-            depth, as stored and with swapped bytes.
-        contours: Of each stretch the contour maps of its colour and of its depth images, both
-            ``[N, H, W]``.
+        roughness: Mean step between neighbouring raw depths relative to the depth, of every fifth
+            depth image: as stored, and with swapped bytes.
+        contours: Contour maps of the colour images and of the depth images, both ``[N, H, W]``, one
+            pair a stretch.
         cell_px: Pixels a cell of the maps.
     """
 
@@ -77,7 +77,7 @@ class ImageStatistics:
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
-        # single images
+        # images without contrast or depth
         grays = [
             np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch
         ]

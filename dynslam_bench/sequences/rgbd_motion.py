@@ -43,7 +43,7 @@ class RgbdPair:
         first: Index of the earlier frame in the sequence.
         second: Index of the later frame.
         pixels_first: Undistorted pixels of all tracked corners in the first frame ``[N, 2]``.
-        depth_first: Their z-depth in metres ``[N]``.
+        depth_first: Z-depth of these corners in the first frame, metres ``[N]``.
         pixels_second: Undistorted pixels of the same corners in the second frame ``[N, 2]``.
         inliers: Which corners agree with the motion ``[N]``.
         T_first_second: Pose of the second camera in the first one's frame ``[4, 4]``, metres; None

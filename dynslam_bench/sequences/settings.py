@@ -10,7 +10,7 @@ Normalisation = Literal["none", "equalise", "clahe", "mean-std"]
 
 
 class PreprocessingSettings(Settings):
-    """What is done to a recorded frame before a tracker sees it; the default changes nothing.
+    """Settings of the steps between a recorded frame and a tracker; the default changes nothing.
 
     The order is: synchronise, undistort, resize, normalise.
     """

@@ -146,7 +146,7 @@ class _Search:
 
     Attributes:
         pairs: Pairs of frames with a motion.
-        motions: Their motions.
+        motions: Motions of these pairs by the images.
         camera: The stated camera.
         readings: The truth read in each convention, by name.
         stated: The best agreement of the truth as it is stored.

@@ -107,14 +107,14 @@ class Masks:
 
 
 @dataclass(frozen=True)
-class Part:
+class SequencePart:
     """The part of a sequence that is seen: which frames of which content.
 
     Attributes:
         id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed
             stays in it.
         content: Digest of the whole content, however much of it is seen.
-        scene: The same without the draw of the sensors' noise.
+        scene: Digest of the content without the draw of the sensors' noise.
         camera: The camera before any preprocessing, without what its ground truth tracks.
         start: First frame of the named part in the numbering of the whole sequence, before any
             offset.
@@ -138,7 +138,7 @@ class Part:
         return digest([self.scene, self.camera, self.start, self.stop, self.stride], 16)
 
 
-def part_of(sequence: Sequence, offset: int = 0) -> Part:
+def sequence_part_of(sequence: Sequence, offset: int = 0) -> SequencePart:
     """The part of a whole sequence that an opened sequence is.
 
     A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and
@@ -160,7 +160,7 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
     noise: int | None = getattr(base, "noise", None)
     scene_digest = getattr(base, "scene_digest", None)
     scene = base.digest() if scene_digest is None else str(scene_digest())
-    return Part(
+    return SequencePart(
         id=str(getattr(base, "whole_id", base.id)),
         content=scene if noise is None else digest([scene, noise]),
         scene=scene,

@@ -308,7 +308,7 @@ class Window:
         Args:
             readout_s: Readout time; the depth image's rows are taken to be read as the colour
                 image's are.
-            delay_s: By which the depth images are exposed later than their stamps say.
+            delay_s: Seconds by which the depth images are exposed later than their stamps say.
         """
         # inverse depths ``[L, n]`` under this delay
         points = self._in_camera(self._at(self.late * readout_s))

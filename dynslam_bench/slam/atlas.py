@@ -63,8 +63,8 @@ class Atlas:
 
     Args:
         slam_map: Keyframes and points of all maps.
-        submaps: Those of a loaded map, from number 1 on.
-        unit_ratio: By how much units of length of two maps may differ: 1 with depth.
+        submaps: Submaps of a loaded map; they get the numbers from 1 on.
+        unit_ratio: Factor by which units of length of two maps may differ: 1 with depth.
 
     Attributes:
         map: Keyframes and points of all maps.
@@ -101,7 +101,7 @@ class Atlas:
         Args:
             number: The submap, or 0.
             T_before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
-            T_after: Those from now on.
+            T_after: World-to-camera poses ``[K, 4, 4]`` of these keyframes from now on.
             scales: What lengths around each were multiplied by ``[K]``.
         """
         centres = se3.inverse(T_before)[:, :3, 3]
@@ -162,7 +162,7 @@ class Atlas:
             number: The submap.
             moved: Where in the root map's world the merge puts a place ``[3]`` of the submap,
                 ``[3]``.
-            drift_m: By how much drift may have put it too far away.
+            drift_m: Distance by which drift may have put it too far away, in units of the root map.
         """
         submap = self.submaps[number]
         return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)
@@ -199,12 +199,13 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
         SettingsError: The file cannot be read, is no map, or one of another camera, features or
             sensor.
     """
+    scales = features.scales(camera.width)
     if not file:
-        return Atlas(Map(camera, features.scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
+        return Atlas(Map(camera, scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
     path = Path(file).expanduser()
     saved = read_map(path)
     saved.check(camera, features, "rgbd" if depth else "rgb", str(path))
-    return unpacked(saved, camera, features.scales)
+    return unpacked(saved, camera, scales)
 
 
 def save_atlas(
@@ -261,7 +262,7 @@ def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]
     arrays["obs_kf"] = row_of_keyframe[keyframe]
     arrays["obs_ft"] = feature
 
-    # submaps
+    # where each submap began, and how far it may lie from there
     places = np.array([(submap.start, submap.anchor) for submap in submaps]).reshape(-1, 2, 3)
     arrays["submap_start"] = places[:, 0]
     arrays["submap_anchor"] = places[:, 1]
@@ -280,7 +281,7 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     Args:
         saved: What was read; it has to fit the camera and the features.
         camera: Undistorted intrinsics.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
     """
     arrays = saved.arrays
     header = saved.header

@@ -1,6 +1,6 @@
 """The back end that all trackers share: what turns the static features of a frame into a pose and a map.
 
-`RgbdBackend.track` follows ORB-SLAM3's ``Tracking::Track``. A frame's initial pose comes from the
+`Backend.track` follows ORB-SLAM3's ``Tracking::Track``. A frame's initial pose comes from the
 last frame or, if that is not trusted, from keyframes (relocalisation). The local map is matched
 around it and the pose is fitted to all matches. A frame that shows enough new becomes a keyframe,
 with local mapping and loop closing. A camera that is not recognised for some frames begins a submap.
@@ -60,7 +60,7 @@ ROOT_MAP = 0
 
 
 class CameraStatus(Enum):
-    """What is known of the camera's place; the back end's states.
+    """States of the back end: how well the camera's place is known.
 
     `INITIALISING` becomes `TRACKED` with the first keyframe or, in a loaded map, when the camera is
     found. `TRACKED` becomes `LOST` with a frame that the map does not explain. `LOST` becomes
@@ -101,7 +101,7 @@ class UncompensatedFrame(NamedTuple):
     measured: Observations
 
 
-class RgbdBackend:
+class Backend:
     """Tracks frames against a map that it builds.
 
     Args:
@@ -231,12 +231,12 @@ class RgbdBackend:
         current = self._predict_frame(frame, measured)
 
         # initial pose: from the last frame, else from keyframes (relocalisation)
-        initial, in_root_map = self._estimate_initial_pose(current)
-        if initial is None and in_root_map is not None:
+        initial, pose_in_root_map = self._estimate_initial_pose(current)
+        if initial is None and pose_in_root_map is not None:
             # the camera is lost in the submap, and found in the root map
             self._leave_submap(current.last)
-            initial = in_root_map
-            in_root_map = None
+            initial = pose_in_root_map
+            pose_in_root_map = None
         if initial is None:
             return self._lose(current)
 
@@ -271,7 +271,7 @@ class RgbdBackend:
             return self._restart_compensated(current, first, velocity, map_fit.count)
 
         # insert a keyframe if the frame shows enough new
-        result = self._update_map(frame, tracked, map_fit, in_root_map)
+        result = self._update_map(frame, tracked, map_fit, pose_in_root_map)
         return _with_match_counts(result, map_fit, initial)
 
     # ------------------------------------------------------------------ steps of tracking
@@ -279,7 +279,7 @@ class RgbdBackend:
     def _predict_frame(self, frame: FrameBundle, measured: Observations) -> CurrentFrame:
         """The frame with its pose by the motion model and its features by the last frame's velocity."""
         last = self._last_tracked_frame(frame, measured)
-        prediction, _ = self.motion.expected(last, frame.timestamp)
+        prediction, _ = self.motion.predict_T_cam_world(last, frame.timestamp)
         observations = measured
         if self._compensates_rolling_shutter():
             observations = self.shutter.predicted(measured, last, frame.timestamp)
@@ -347,10 +347,10 @@ class RgbdBackend:
             seed=self.seed,
             frame=current.bundle.index,
         )
-        in_root_map = search.in_root_map() if tracked and in_submap else None
+        pose_in_root_map = search.pose_in_root_map() if tracked and in_submap else None
         if initial is None:
             initial = search.relocalised(from_last_frame)
-        return initial, in_root_map
+        return initial, pose_in_root_map
 
     def _relocalisation_candidates(
         self, current: CurrentFrame
@@ -550,7 +550,7 @@ class RgbdBackend:
         frame: FrameBundle,
         tracked: TrackedFrame,
         map_fit: MapFit,
-        in_root_map: InitialPose | None,
+        pose_in_root_map: InitialPose | None,
     ) -> TrackResult:
         """Insert the tracked frame as a keyframe if the policy or a merge asks for it, and record its pose.
 
@@ -558,16 +558,16 @@ class RgbdBackend:
             frame: The frame.
             tracked: Its pose and map points in the active map.
             map_fit: The fit that gave them.
-            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+            pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         timings: dict[str, float] = {}
-        verdict = RootMapPose.REJECTED
+        root_map_pose = RootMapPose.REJECTED
         pose = map_fit.estimate.T_cam_world
-        needed = in_root_map is not None or self._keyframe_policy.needs_keyframe(
+        needed = pose_in_root_map is not None or self._keyframe_policy.needs_keyframe(
             self.map, tracked, frame.index, self._reference_keyframe
         )
         if self._mapping_enabled and needed:
-            timings, verdict = self._insert_keyframe(frame, tracked, in_root_map)
+            timings, root_map_pose = self._insert_keyframe(frame, tracked, pose_in_root_map)
             # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
             self.motion.relocate(pose)
@@ -581,29 +581,31 @@ class RgbdBackend:
         )
 
         merged = self.atlas.active == ROOT_MAP
-        if in_root_map is None or merged or verdict is RootMapPose.REJECTED:
+        if pose_in_root_map is None or merged or root_map_pose is RootMapPose.REJECTED:
             return result
         # the camera is in the root map, too: there its pose counts
-        self._record_root_map_pose(in_root_map)
-        if verdict is RootMapPose.CONTINUE_THERE:
-            self._continue_in_root_map(tracked, in_root_map)
-        return replace(result, T_world_cam=se3.inverse(in_root_map.T_cam_world), state="ok")
+        self._record_root_map_pose(pose_in_root_map)
+        if root_map_pose is RootMapPose.CONTINUE_THERE:
+            self._continue_in_root_map(tracked, pose_in_root_map)
+        return replace(result, T_world_cam=se3.inverse(pose_in_root_map.T_cam_world), state="ok")
 
-    def _record_root_map_pose(self, in_root_map: InitialPose) -> None:
+    def _record_root_map_pose(self, pose_in_root_map: InitialPose) -> None:
         """The last recorded pose becomes relative to a keyframe of the root map."""
-        T_ref_world = self.map.kf_pose[in_root_map.keyframe]
+        T_ref_world = self.map.kf_pose[pose_in_root_map.keyframe]
         recorded = self.history[-1]
-        recorded.reference = in_root_map.keyframe
-        recorded.T_cam_ref = in_root_map.T_cam_world @ se3.inverse(T_ref_world)
+        recorded.reference = pose_in_root_map.keyframe
+        recorded.T_cam_ref = pose_in_root_map.T_cam_world @ se3.inverse(T_ref_world)
 
-    def _continue_in_root_map(self, tracked: TrackedFrame, in_root_map: InitialPose) -> None:
+    def _continue_in_root_map(self, tracked: TrackedFrame, pose_in_root_map: InitialPose) -> None:
         """Tracking continues in the root map; the submap stays apart."""
-        matched = in_root_map.matches.point
+        matched = pose_in_root_map.matches.point
         # mapping may have removed some of the matched points since
         alive = np.where(self.map.alive[matched], matched, -1)
-        observed = observe_points(tracked.observations, in_root_map.matches.feature, alive)
-        self._last_frame = replace(tracked, point=observed, T_cam_world=in_root_map.T_cam_world)
-        self._reference_keyframe = in_root_map.keyframe
+        observed = observe_points(tracked.observations, pose_in_root_map.matches.feature, alive)
+        self._last_frame = replace(
+            tracked, point=observed, T_cam_world=pose_in_root_map.T_cam_world
+        )
+        self._reference_keyframe = pose_in_root_map.keyframe
         self._forget_motion()
         self._update_active_map()
 
@@ -615,22 +617,22 @@ class RgbdBackend:
         self.history.append(recorded)
 
     def _insert_keyframe(
-        self, frame: FrameBundle, tracked: TrackedFrame, in_root_map: InitialPose | None = None
+        self, frame: FrameBundle, tracked: TrackedFrame, pose_in_root_map: InitialPose | None = None
     ) -> tuple[dict[str, float], RootMapPose]:
         """Make a tracked frame a keyframe, with bundle adjustment and loop closing.
 
         Args:
             frame: The frame.
             tracked: Its features, pose and map points; the latter two become those after mapping.
-            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+            pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
 
         Returns:
             Seconds by stage, and whether the pose in the root map counts.
         """
         slam_map = self.map
-        verdict = RootMapPose.REJECTED
+        root_map_pose = RootMapPose.REJECTED
 
-        # local mapping
+        # local mapping: insert the keyframe, triangulate, cull, adjust its neighbourhood
         slot, timings = self.mapper.insert(
             tracked.observations,
             tracked.point,
@@ -642,12 +644,12 @@ class RgbdBackend:
         self._reference_keyframe = slot
         self._transfer_history()
 
-        # loop closing
+        # loop closing: recognise an earlier place, and correct the map
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
             T_before = slam_map.kf_pose[slot].copy()
-            closing = self.loops.close(slot, tracked.observations, in_root_map)
-            verdict = closing.root_map_pose
+            closing = self.loops.close(slot, tracked.observations, pose_in_root_map)
+            root_map_pose = closing.root_map_pose
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
@@ -660,7 +662,7 @@ class RgbdBackend:
         tracked.point = slam_map.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = slam_map.kf_pose[slot].copy()
         slam_map.release()
-        return timings, verdict
+        return timings, root_map_pose
 
     def _transfer_history(self) -> None:
         """Poses relative to a culled keyframe become relative to its replacement."""
@@ -672,7 +674,7 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ what filters and files read
 
-    def predict(self, timestamp: float) -> tuple[Array | None, Array | None]:
+    def predict_T_world_cam(self, timestamp: float) -> tuple[Array | None, Array | None]:
         """Camera-to-world pose at a time, and the covariance of the motion since the last frame; None while lost.
 
         The covariance ``[6, 6]`` is of (position in the world in metres, rotation in the camera
@@ -684,11 +686,13 @@ class RgbdBackend:
         """
         if self._last_frame is None or self._status is not CameraStatus.TRACKED:
             return None, None
-        T_cam_world, covariance = self.motion.expected(self._last_frame, timestamp, jitter=JITTER)
+        T_cam_world, covariance = self.motion.predict_T_cam_world(
+            self._last_frame, timestamp, jitter=JITTER
+        )
         return se3.inverse(T_cam_world), covariance
 
     def view(self) -> MapView:
-        """What filters may read of the map that the camera is in; `finalize` does not change it."""
+        """View for filters of the map that the camera is in; `finalize` does not change it."""
         return self._map_views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
@@ -733,7 +737,7 @@ def _with_match_counts(result: TrackResult, map_fit: MapFit, initial: InitialPos
     return replace(result, stats={**result.stats, **counts})
 
 
-class MonocularBackend(RgbdBackend):
+class MonocularBackend(Backend):
     """Tracks frames against a map whose points are triangulated; lengths are in units of its initial median depth.
 
     No feature has a depth. The scale of bundle adjustment is free but for the keyframes that stay.
@@ -743,7 +747,7 @@ class MonocularBackend(RgbdBackend):
     settings: MonocularBackendSettings
 
     def reset(self, camera: Camera, seed: int) -> None:
-        """Forget everything and begin a new sequence, as `RgbdBackend.reset` does."""
+        """Forget everything and begin a new sequence, as `Backend.reset` does."""
         super().reset(camera, seed)
         self._initialiser = TwoViewInitialiser()
 
@@ -799,7 +803,7 @@ class MonocularBackend(RgbdBackend):
 
 def build_backend(
     settings: BackendSettings, scale_factor: float, levels: int, extractor: str
-) -> RgbdBackend:
+) -> Backend:
     """Build the back end that settings ask for: without depth for `MonocularBackendSettings`, else with depth.
 
     Args:
@@ -808,5 +812,5 @@ def build_backend(
         levels: Number of pyramid levels of the features.
         extractor: Id of the feature extractor.
     """
-    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else RgbdBackend
+    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else Backend
     return kind(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)

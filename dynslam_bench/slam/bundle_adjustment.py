@@ -450,10 +450,13 @@ def _adjust(
     """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`."""
     # the kernel is as wide as the residuals are at the start
     _robust_cost(poses, points, observations, camera, 1.0, chi2)
-    width = cauchy_width(np.where(observations.measured.info_right > 0.0, chi2 * DEPTH_SHARE, chi2))
+    trial = np.empty(len(chi2))
+    for k in range(len(chi2)):
+        depth = observations.measured.info_right[k] > 0.0
+        trial[k] = chi2[k] * DEPTH_SHARE if depth else chi2[k]
+    width = cauchy_width(trial)
     cost = _robust_cost(poses, points, observations, camera, width, chi2)
     damping = DAMPING
-    trial = np.empty_like(chi2)
     for _ in range(iterations):
         # try a step
         new_poses = poses.copy()
@@ -479,7 +482,8 @@ def _adjust(
                 poses = new_poses
                 points = new_points
                 cost = new
-                chi2[:] = trial
+                for k in range(len(chi2)):
+                    chi2[k] = trial[k]
                 if gain < CONVERGED_GAIN * cost:
                     break
                 continue

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.features.matching import rotation_consistent, search_in_radius
-from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.geometry import Camera, feature_scale, se3
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
@@ -469,7 +469,7 @@ class InitialMap:
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
-        # two keyframes
+        # both views become keyframes; the second one's pose follows from the measured motion
         T_second_world = self.motion.T_second_first @ T_first_world
         slots: list[int] = []
         for view, pose in ((self.first, T_first_world), (self.second, T_second_world)):
@@ -522,7 +522,10 @@ class TwoViewInitialiser:
         matches = np.zeros((0, 2), np.int64)
         if first is not None:
             matches = match_views(
-                first.observations, observations, self._expected, settings.radius_px
+                first.observations,
+                observations,
+                self._expected,
+                settings.radius_px * feature_scale(camera.width),
             )
         view = View(frame, observations, matches)
 

@@ -23,7 +23,6 @@ from dynslam_bench.features.matching import (
     search_in_radius,
 )
 from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import STATED_WIDTH
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
@@ -72,8 +71,6 @@ MIN_CLOSE = 100
 """Fewer tracked close points than this are few (ORB-SLAM2)."""
 NEW_CLOSE = 70
 """More close features than this that are not in the map are many: where few are tracked, they make a keyframe."""
-NEW_SHARE = 0.5
-"""More than this share of the close features are many, too, in images below VGA's width, which have few in all."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
@@ -211,7 +208,7 @@ class LocalMapper:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
         slam_map = self.map
         young = self._young[slam_map.alive[self._young]]
-        # in keyframes
+        # age in keyframes since the point was made
         age = slam_map.next_keyframe - 1 - slam_map.born[young]
         min_found_ratio = self.settings.mapping.min_found_ratio
         seldom_found = slam_map.found[young] < min_found_ratio * slam_map.visible[young]
@@ -425,10 +422,7 @@ class KeyframePolicy:
 
         # many close features are not in the map, and few are tracked or the last keyframe is long ago
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
-        enough_new: float = NEW_CLOSE
-        if slam_map.camera.width < STATED_WIDTH:
-            enough_new = min(NEW_CLOSE, NEW_SHARE * np.count_nonzero(close))
-        many_new = np.count_nonzero(close & ~matched) > enough_new
+        many_new = np.count_nonzero(close & ~matched) > NEW_CLOSE
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if many_new and (few_close or frame - self._last >= settings.max_gap):
             return True
@@ -503,7 +497,21 @@ def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
 def _triangulate(
     view_a: View, view_b: View, scales: Array, camera: Intrinsics, sigmas: float
 ) -> tuple[Slots, Slots, Array]:
-    """Features of both views that fit one point ``[M]``, ``[M]``, and its depth in `view_a` ``[M]``."""
+    """Triangulate free features of two views that match along epipolar lines.
+
+    Args:
+        view_a: The new keyframe, with N features that observe no point yet.
+        view_b: A neighbour of it, with M such features.
+        scales: Scale of each octave of the image pyramid, 1 for the finest.
+        camera: Intrinsics without distortion, pixels.
+        sigmas: Least angle between two rays for a triangulation by both, in standard deviations of
+            a feature's position.
+
+    Returns:
+        Positions in `free`: for each free feature of `view_b` the one of `view_a` whose best match
+        it is, ``[M]``, -1 without; for each of `view_a` its best match ``[N]``, -1 without, and the
+        point's depth in `view_a` ``[N]``, metres with depth.
+    """
     r, t = _relative_pose(view_a.pose, view_b.pose)
     n = view_a.free.shape[0]
     m = view_b.free.shape[0]
@@ -511,84 +519,90 @@ def _triangulate(
     depth = np.zeros(n)
     best_distance = np.full(n, FAR, np.int64)
     # rays of b's features, (bx, by, 1)
-    bx = (view_b.xy[view_b.free, 0] - camera.cx) / camera.fx
-    by = (view_b.xy[view_b.free, 1] - camera.cy) / camera.fy
+    bx = np.empty(m)
+    by = np.empty(m)
+    for j in range(m):
+        bx[j] = (view_b.xy[view_b.free[j], 0] - camera.cx) / camera.fx
+        by[j] = (view_b.xy[view_b.free[j], 1] - camera.cy) / camera.fy
     cosine_limit = np.cos(MIN_PARALLAX)
     focal = 0.5 * (camera.fx + camera.fy)
     for i in range(n):
-        # ray of a's feature, (x, y, 1) in camera a and d in camera b
+        # ray of a's feature: (x, y, 1) in the frame of camera a, (ray_x, ray_y, ray_z) in that of b
         a = view_a.free[i]
         x = (view_a.xy[a, 0] - camera.cx) / camera.fx
         y = (view_a.xy[a, 1] - camera.cy) / camera.fy
-        d0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
-        d1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
-        d2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
+        ray_x = r[0, 0] * x + r[0, 1] * y + r[0, 2]
+        ray_y = r[1, 0] * x + r[1, 1] * y + r[1, 2]
+        ray_z = r[2, 0] * x + r[2, 1] * y + r[2, 2]
 
-        # its epipolar line in b: t x d
-        l0 = t[1] * d2 - t[2] * d1
-        l1 = t[2] * d0 - t[0] * d2
-        l2 = t[0] * d1 - t[1] * d0
-        norm = np.sqrt(l0 * l0 + l1 * l1)
+        # its epipolar line in b: t x ray
+        line_x = t[1] * ray_z - t[2] * ray_y
+        line_y = t[2] * ray_x - t[0] * ray_z
+        line_1 = t[0] * ray_y - t[1] * ray_x
+        norm = np.sqrt(line_x * line_x + line_y * line_y)
         if norm < 1e-9:
             continue
-        length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        length = np.sqrt(ray_x * ray_x + ray_y * ray_y + ray_z * ray_z)
         for j in range(m):
             # b's feature must lie on the line
             b = view_b.free[j]
             sigma = scales[view_b.octave[b]] / focal
-            off = (l0 * bx[j] + l1 * by[j] + l2) / norm
+            off = (line_x * bx[j] + line_y * by[j] + line_1) / norm
             if off * off > CHI2_LINE * sigma * sigma:
                 continue
 
-            # and look more alike than the best one so far
-            d = distance(view_a.descriptors[a], view_b.descriptors[b])
-            if d > MAX_DISTANCE or d >= best_distance[i]:
+            # and look more alike than the best one so far, by differing bits of the descriptors
+            bits = distance(view_a.descriptors[a], view_b.descriptors[b])
+            if bits > MAX_DISTANCE or bits >= best_distance[i]:
                 continue
 
-            # depth s along a's ray: by triangulation where there is parallax (least squares of
-            # ray_b x (s d + t) = 0 in its first two rows), else from b's measured depth
-            p0 = d0 - bx[j] * d2
-            p1 = d1 - by[j] * d2
-            q0 = bx[j] * t[2] - t[0]
-            q1 = by[j] * t[2] - t[1]
-            cosine = (d0 * bx[j] + d1 * by[j] + d2) / (
+            # depth along a's ray where there is parallax, so that the point's projection in b is b's
+            # feature: depth_a * coefficient = offset in x and y, solved by least squares
+            coefficient_x = ray_x - bx[j] * ray_z
+            coefficient_y = ray_y - by[j] * ray_z
+            offset_x = bx[j] * t[2] - t[0]
+            offset_y = by[j] * t[2] - t[1]
+            cosine = (ray_x * bx[j] + ray_y * by[j] + ray_z) / (
                 length * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
             )
             least = sigmas * max(scales[view_a.octave[a]], scales[view_b.octave[b]]) / focal
             if cosine < cosine_limit and cosine < 1.0 - 0.5 * least * least:
-                s = (p0 * q0 + p1 * q1) / (p0 * p0 + p1 * p1)
-            elif view_b.z[b] > 0.0 and abs(d2) > 1e-6:
-                s = (view_b.z[b] - t[2]) / d2
+                depth_a = (coefficient_x * offset_x + coefficient_y * offset_y) / (
+                    coefficient_x * coefficient_x + coefficient_y * coefficient_y
+                )
+            # else from b's measured depth
+            elif view_b.z[b] > 0.0 and abs(ray_z) > 1e-6:
+                depth_a = (view_b.z[b] - t[2]) / ray_z
             else:
                 continue
 
-            # the point must lie in front of both cameras, w in b, and where b measured it
-            w = d2 * s + t[2]
-            z_b = view_b.z[b]
+            # the point must lie in front of both cameras, and where b measured it
+            depth_b = ray_z * depth_a + t[2]
+            measured_b = view_b.z[b]
             if (
-                s < MIN_TRIANGULATED_DEPTH
-                or w < MIN_TRIANGULATED_DEPTH
-                or s > MAX_TRIANGULATED_DEPTH
-                or (z_b > 0.0 and abs(w - z_b) > DEPTH_TOLERANCE * z_b)
+                depth_a < MIN_TRIANGULATED_DEPTH
+                or depth_b < MIN_TRIANGULATED_DEPTH
+                or depth_a > MAX_TRIANGULATED_DEPTH
+                or (measured_b > 0.0 and abs(depth_b - measured_b) > DEPTH_TOLERANCE * measured_b)
             ):
                 continue
 
             # its projection must fit b's feature
-            e0 = (d0 * s + t[0]) / w - bx[j]
-            e1 = (d1 * s + t[1]) / w - by[j]
-            if e0 * e0 + e1 * e1 > CHI2_POINT * sigma * sigma:
+            error_x = (ray_x * depth_a + t[0]) / depth_b - bx[j]
+            error_y = (ray_y * depth_a + t[1]) / depth_b - by[j]
+            if error_x * error_x + error_y * error_y > CHI2_POINT * sigma * sigma:
                 continue
 
             # the nearer view shows the patch larger, hence at a coarser octave
-            ratio = (s * np.sqrt(x * x + y * y + 1.0)) / (
-                w * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
+            ratio = (depth_a * np.sqrt(x * x + y * y + 1.0)) / (
+                depth_b * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
             )
             expected = scales[view_b.octave[b]] / scales[view_a.octave[a]]
             if ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected:
                 continue
-            best_distance[i] = d
+            best_distance[i] = bits
             match[i] = j
-            depth[i] = s
+            depth[i] = depth_a
 
     # one feature of b for one of a: the smaller distance wins, then the lower index
     matched_by = np.full(m, -1, np.int64)
@@ -596,8 +610,7 @@ def _triangulate(
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
-    chosen = np.sort(matched_by[matched_by >= 0])
-    return view_a.free[chosen], view_b.free[match[chosen]], depth[chosen]
+    return matched_by, match, depth
 
 
 def triangulate(
@@ -617,14 +630,19 @@ def triangulate(
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    features, other_features, depth = _triangulate(
-        _view(slam_map, slot),
-        _view(slam_map, other),
+    view = _view(slam_map, slot)
+    other_view = _view(slam_map, other)
+    matched_by, match, depth = _triangulate(
+        view,
+        other_view,
         slam_map.scales,
         intrinsics_of(slam_map.camera),
         float(min_parallax_sigmas),
     )
-    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth)
+    chosen = np.sort(matched_by[matched_by >= 0])
+    features = view.free[chosen]
+    other_features = other_view.free[match[chosen]]
+    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth[chosen])
     position = se3.transform(se3.inverse(slam_map.kf_pose[slot]), local)
     return features, other_features, position
 

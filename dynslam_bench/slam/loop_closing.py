@@ -32,8 +32,8 @@ from dynslam_bench.slam.local_mapping import LocalMapper
 from dynslam_bench.slam.map import Array, Slots
 from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.relocalisation import (
-    around,
     is_aliased,
+    keyframe_neighbourhood,
     pose_uncertainty,
     recognise_place,
     recognition_scores,
@@ -121,7 +121,7 @@ class Correction:
 
     @property
     def T_now_before(self) -> Array:
-        """From the keyframe's world, once its lengths are multiplied, to that of the place, ``[4, 4]``."""
+        """Transform ``[4, 4]`` from the keyframe's world, once its lengths are multiplied, to the place's world."""
         before = self.T_cam_before.copy()
         before[:3, 3] *= self.scale
         return se3.inverse(self.T_cam_now) @ before
@@ -163,7 +163,7 @@ class Loop:
 
 
 class RootMapPose(Enum):
-    """What follows from a pose in the root map that was found for a camera in a submap."""
+    """Verdict on a pose in the root map that was found for a camera in a submap."""
 
     REJECTED = "rejected"
     """There is none, or it is ambiguous or cannot be reached: the frame is tracked in the submap alone."""
@@ -193,7 +193,7 @@ class LoopCloser:
     Args:
         atlas: The maps.
         mapper: Fuses and adjusts.
-        settings: Of the back end.
+        settings: Settings of the back end.
         seed: Founds RANSAC's draws.
         scale_is_known: Whether lengths are metres everywhere, as with depth.
 
@@ -230,24 +230,24 @@ class LoopCloser:
         self._loop_edges: list[Edge] = []
 
     def close(
-        self, slot: int, observations: Observations, in_root_map: InitialPose | None = None
+        self, slot: int, observations: Observations, pose_in_root_map: InitialPose | None = None
     ) -> LoopClosingResult:
         """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
             observations: Its features.
-            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+            pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         self._extend_path(slot)
         self._transfer_loop_edges()
 
         # detect a place and verify it
         root_map_pose = RootMapPose.REJECTED
-        if in_root_map is None:
+        if pose_in_root_map is None:
             loop = self._verified(slot, observations)
         else:
-            loop, root_map_pose = self._loop_to_root_map(slot, observations, in_root_map)
+            loop, root_map_pose = self._loop_to_root_map(slot, observations, pose_in_root_map)
         if root_map_pose is RootMapPose.REJECTED:
             self._in_root_map_since = None
 
@@ -257,13 +257,13 @@ class LoopCloser:
             return LoopClosingResult(root_map_pose=root_map_pose)
         if not confirmed.fits:
             # the submap has drifted too far to be merged
-            if in_root_map is not None:
+            if pose_in_root_map is not None:
                 root_map_pose = RootMapPose.CONTINUE_THERE
             return LoopClosingResult(root_map_pose=root_map_pose)
         # the loop to the root map was tested for aliasing before
         if (
             confirmed.merges
-            and in_root_map is None
+            and pose_in_root_map is None
             and self._aliased(slot, observations, confirmed)
         ):
             return LoopClosingResult(root_map_pose=root_map_pose)
@@ -341,7 +341,7 @@ class LoopCloser:
             return None
 
         # by place recognition: a candidate has to score as well as the worst of the neighbours
-        near = np.setdiff1d(around(slam_map, slot)[1:], old)
+        near = np.setdiff1d(keyframe_neighbourhood(slam_map, slot)[1:], old)
         score = recognition_scores(slam_map, np.concatenate([near, old]), observations)
         least = score[: len(near)].min(initial=np.inf)
         score = score[len(near) :]
@@ -364,7 +364,7 @@ class LoopCloser:
         tracking = self.settings.tracking
         least = MIN_MATCHES, MIN_MATCHES // 2
         place = recognise_place(self.map, candidate, observations, tracking, rng, *least)
-        if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
+        if place is None or len(place.matches) < s.min_inliers or place.seen_share < MIN_SHARE:
             return None
 
         # the correction, which drift has to explain; for a merge the pose must be well determined
@@ -393,7 +393,7 @@ class LoopCloser:
         # a merge needs more than a pose
         determined = (
             len(place.matches) >= self.settings.loop_closing.min_inliers
-            and place.share >= MERGE_SHARE
+            and place.seen_share >= MERGE_SHARE
             and place.uncertainty <= MERGE_UNCERTAINTY
         )
         merge = loop if determined else None
@@ -442,7 +442,7 @@ class LoopCloser:
         correction = loop.correction
         # between submaps: matches, and the rotation that the maps may have against each other
         if loop.merges:
-            if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
+            if len(place.matches) < MERGE_INLIERS or place.seen_share < MERGE_SHARE:
                 return False
             slack = self.atlas.slack(*self.map.kf_map[[slot, place.keyframe]].tolist())
             return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)
@@ -619,8 +619,8 @@ class LoopCloser:
 
     def _fuse(self, slot: int, candidate: int) -> None:
         """Fuse the points around both ends of a loop, and adjust what lies around the new keyframe."""
-        points = self.map.points_of(around(self.map, candidate))
-        for keyframe in around(self.map, slot).tolist():
+        points = self.map.points_of(keyframe_neighbourhood(self.map, candidate))
+        for keyframe in keyframe_neighbourhood(self.map, slot).tolist():
             self.mapper.fuse_into(keyframe, points)
         self.map.refresh(points[self.map.alive[points]])
         self.mapper.adjust(slot)
@@ -695,10 +695,10 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
     Drift-Aware Large Scale Monocular SLAM, RSS 2010) solve for scales and poses together.
 
     Args:
-        ids: Of the keyframes, ``[N]``, ascending.
+        ids: Ids of the keyframes, int64 ``[N]``, ascending.
         edges: Edges along which scale was kept. The oldest keyframe of each connected component
             stays.
-        loop_edge: From the keyframe that was recognised to the one that recognises it.
+        loop_edge: Edge from the keyframe that was recognised to the one that recognises it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
     Returns:
@@ -734,7 +734,7 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     """The poses that fit the edges best; the first one stays.
 
     Args:
-        ids: Of the poses, ``[N]``, ascending.
+        ids: Ids of the keyframes whose poses are optimised, int64 ``[N]``, ascending.
         poses: World to camera ``[N, 4, 4]``, where the search starts.
         edges: Edges between them; the graph must be connected.
 

@@ -151,7 +151,7 @@ class Map:
 
     Args:
         camera: Intrinsics without distortion.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
 
     Attributes:
         kf_alive: bool ``[S]``, whether the slot is in use.
@@ -187,7 +187,7 @@ class Map:
         n_obs: int32 ``[M]``, number of observations.
         obs_kf: int32 ``[M, O]``, slots of the observing keyframes, oldest first.
         obs_ft: int32 ``[M, O]``, their features.
-        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors
+        substrings: The keyframe's id and sorted substrings of its descriptors, by keyframe slot
             (`relocalisation`).
     """
 
@@ -332,8 +332,8 @@ class Map:
 
         Args:
             number: The submap.
-            T_new_old: From the submap's world to the world of the other, ``[4, 4]``.
-            merged_into: The other's number.
+            T_new_old: Transform ``[4, 4]`` from the submap's world to the world of the other.
+            merged_into: Number of the submap that it becomes part of.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
         # scale the keyframes' translations, then move their poses: T_cam_new = T_cam_old T_new_old^-1
@@ -423,8 +423,9 @@ class Map:
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
         views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
+        to_octave_0 = self.scales / self.scales[0]
         _refresh(
-            points, self._point_views, self.descriptor, self._observation_tables, views, self.scales
+            points, self._point_views, self.descriptor, self._observation_tables, views, to_octave_0
         )
 
     def release(self) -> None:
@@ -465,17 +466,18 @@ class Map:
         """
         # with a single level any factor gives octave 0
         scale_factor = float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2
+        count, index, uv, right, octave, cosine = _project(
+            np.ascontiguousarray(T_cam_world),
+            candidates,
+            self._point_views,
+            intrinsics_of(self.camera),
+            float(self.camera.width),
+            float(self.camera.height),
+            scale_factor,
+            len(self.scales),
+        )
         return VisiblePoints(
-            *_project(
-                np.ascontiguousarray(T_cam_world),
-                candidates,
-                self._point_views,
-                intrinsics_of(self.camera),
-                float(self.camera.width),
-                float(self.camera.height),
-                scale_factor,
-                len(self.scales),
-            )
+            index[:count], uv[:count], right[:count], octave[:count], cosine[:count]
         )
 
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
@@ -516,7 +518,7 @@ def map_outputs(slam_map: Map) -> MapOutputs:
 
 
 def _keyframe_record(slam_map: Map, slot: int) -> KeyframeRecord:
-    """What files hold of a keyframe."""
+    """The record of a keyframe that files hold."""
     return KeyframeRecord(
         int(slam_map.kf_id[slot]),
         int(slam_map.kf_frame[slot]),
@@ -556,7 +558,7 @@ class MapViews:
         }
 
     def of(self, submap: int) -> MapView:
-        """What filters see while the camera is in a submap."""
+        """View that filters get while the camera is in a submap."""
         slam_map = self._map
         if self._computed_for != (slam_map.next_keyframe, submap):
             self._computed_for = slam_map.next_keyframe, submap
@@ -567,7 +569,7 @@ class MapViews:
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
-        """What filters may read of a keyframe."""
+        """The part of a keyframe that filters may read."""
         slam_map = self._map
         n = int(slam_map.kf_count[slot])
         keypoints = Keypoints(
@@ -595,8 +597,9 @@ def _link_one(tables: ObservationTables, keyframe: int, feature: int, point: int
     """Add an observation of a point; a second one by the same keyframe is skipped."""
     # in the point's list
     end = tables.n_obs[point]
-    if (tables.obs_kf[point, :end] == keyframe).any():
-        return
+    for o in range(end):
+        if tables.obs_kf[point, o] == keyframe:
+            return
     tables.obs_kf[point, end] = keyframe
     tables.obs_ft[point, end] = feature
     tables.n_obs[point] += 1
@@ -712,8 +715,8 @@ def _project(
     height: float,
     scale_factor: float,
     levels: int,
-) -> tuple[Slots, Array, Array, Slots, Array]:
-    """The candidate points that the camera should see, see `VisiblePoints`.
+) -> tuple[int, Slots, Array, Array, Slots, Array]:
+    """How many of the candidate points the camera should see, and these, see `VisiblePoints`, in longer arrays.
 
     They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
     side that they were seen from before (ORB-SLAM2's ``isInFrustum``).
@@ -726,11 +729,12 @@ def _project(
     cosine = np.empty(n)
 
     # camera centre in the world
-    r = pose[:3, :3]
-    t = pose[:3, 3]
-    ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
-    oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
-    oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
+    tx = pose[0, 3]
+    ty = pose[1, 3]
+    tz = pose[2, 3]
+    ox = -(pose[0, 0] * tx + pose[1, 0] * ty + pose[2, 0] * tz)
+    oy = -(pose[0, 1] * tx + pose[1, 1] * ty + pose[2, 1] * tz)
+    oz = -(pose[0, 2] * tx + pose[1, 2] * ty + pose[2, 2] * tz)
     coarsest_scale = scale_factor ** (levels - 1)
     inverse_log = 1.0 / np.log(scale_factor)
     count = 0
@@ -768,13 +772,7 @@ def _project(
         right[count] = u - camera.bf / zc
         cosine[count] = c
         count += 1
-    return (
-        index[:count].copy(),
-        uv[:count].copy(),
-        right[:count].copy(),
-        octave[:count].copy(),
-        cosine[:count].copy(),
-    )
+    return count, index, uv, right, octave, cosine
 
 
 @kernel

@@ -22,7 +22,7 @@ from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core import DynslamError, RunError, SettingsError, TrackerError, write_atomic
 from dynslam_bench.core.reading import MOST_BYTES, TABLE_BYTES, read_bytes, read_npz
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.geometry import Camera, format_ns, ns_of, se3
+from dynslam_bench.geometry import Camera, feature_scale, format_ns, ns_of, se3
 
 MAP_FILE = "map.npz"
 """Name of a run's saved map."""
@@ -114,10 +114,9 @@ class MapFeatures(Record):
     levels: int = Field(ge=1, le=64)
     scale_factor: float = Field(ge=1, le=100)
 
-    @property
-    def scales(self) -> NDArray[np.float64]:
-        """Scale of each level."""
-        return np.asarray(self.scale_factor ** np.arange(self.levels, dtype=np.float64))
+    def scales(self, width: int) -> NDArray[np.float64]:
+        """Pixels of an image of a width in a pixel of each level, ``[levels]``."""
+        return feature_scale(width) * self.scale_factor ** np.arange(self.levels, dtype=np.float64)
 
 
 class MapHeader(Record):
@@ -152,7 +151,7 @@ class SavedMap:
 
     Attributes:
         header: Where it comes from.
-        arrays: By name, see `KEYFRAME_ARRAYS` and those after it.
+        arrays: Arrays by name, see `KEYFRAME_ARRAYS` and those after it.
     """
 
     header: MapHeader
@@ -163,7 +162,7 @@ class SavedMap:
 
         Args:
             camera: The system's.
-            features: Those that it extracts.
+            features: The kind of features that the system extracts.
             sensors: ``rgbd`` or ``rgb``.
             file: For the message.
 
@@ -234,7 +233,7 @@ def read_map(path: Path) -> SavedMap:
     except DynslamError as error:
         raise SettingsError(str(error)) from error
 
-    # the tables
+    # refuse arrays that do not fit each other
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     fault = next(_faults(arrays, header), None)
     if fault is not None:
@@ -302,7 +301,7 @@ def _size_faults(arrays: Arrays) -> Iterator[str]:
         if not np.isfinite(arrays[name]).all():
             yield f"'{name}' holds values that are not finite"
 
-    # descriptors
+    # descriptors no longer than the matcher reads
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     if words > MAX_WORDS:
         yield f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"

@@ -56,12 +56,12 @@ _START_SPEED = np.repeat([1.0, 2.0], 3)
 
 
 def pose_covariance(T_cam_world: Array, information: Array, inflation: float = INFLATION) -> Array:
-    """Covariance ``[6, 6]`` of (position in the world, rotation in the camera frame) of a measured pose.
+    """Covariance ``[6, 6]`` of a measured pose: position in the world (m), rotation in the camera frame (rad).
 
     Args:
         T_cam_world: The measured world-to-camera pose.
         information: Gauss-Newton matrix of (translation, rotation) for ``exp(xi) @ T_cam_world``.
-        inflation: Factor on the covariance.
+        inflation: Factor on the covariance, see `INFLATION`.
     """
     # derivative of the twist by (position in the world, rotation in the camera frame)
     j = np.zeros((6, 6))
@@ -85,7 +85,6 @@ def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
     return noise
 
 
-@kernel
 def _rotated(rotation: Array, vector: Array) -> Array:
     """A rotation matrix ``[3, 3]`` rotated further by a rotation vector ``[3]``, and kept orthonormal."""
     pose = np.eye(4)
@@ -202,11 +201,13 @@ def smooth(
     cuts = np.flatnonzero(np.diff(stamps) > MAX_GAP_S) + 1
     for rows in np.split(np.arange(len(stamps)), cuts):
         if len(rows) > 2:
-            out[rows] = _smooth_part(stamps[rows], T_cam_world[rows], covariances[rows], settings)
+            out[rows] = _smooth_segment(
+                stamps[rows], T_cam_world[rows], covariances[rows], settings
+            )
     return out
 
 
-def _smooth_part(
+def _smooth_segment(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
     """`smooth` within a part without gaps."""
@@ -267,13 +268,13 @@ class CameraMotion:
 
         Args:
             T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
-            T_cam_now: That pose now.
+            T_cam_now: World-to-camera pose of the same keyframe now.
             scale: What lengths around it were multiplied by.
         """
         if self.state is not None:
             self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
-    def expected(
+    def predict_T_cam_world(
         self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0
     ) -> tuple[Array, Array | None]:
         """World-to-camera pose at a time, and the covariance of the motion since the last frame.
@@ -403,8 +404,15 @@ def _compensated(
     """Pixels and depths of features that were exposed so many seconds after the middle row, as of that row's time."""
     xy = xy.copy()
     z = z.copy()
-    speed = np.sqrt((angular**2).sum())
-    ax, ay, az = angular / max(speed, 1e-12)
+    # axis and angle per second
+    ax = angular[0]
+    ay = angular[1]
+    az = angular[2]
+    speed = np.sqrt(ax * ax + ay * ay + az * az)
+    length = max(speed, 1e-12)
+    ax /= length
+    ay /= length
+    az /= length
     for i in range(len(xy)):
         # the point before it moved on; without depth it is a direction, which only the rotation changes
         has_depth = z[i] > 0

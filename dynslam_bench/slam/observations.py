@@ -78,7 +78,7 @@ def observe(
         keep: bool ``[N]``, False rows are left out entirely.
         weight: float32 ``[N]`` in [0, 1], scales the information of a feature.
         camera: Intrinsics.
-        scales: Scale of each octave.
+        scales: Pixels of the image in a pixel of each octave.
     """
     # features that the filters kept, with a finite pixel
     weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)

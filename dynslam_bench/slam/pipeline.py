@@ -38,10 +38,11 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.settings import GuardSettings
+from dynslam_bench.features.enlarging import enlarged, enlarged_mask, in_given_image
 from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.backend import Backend
 
 if TYPE_CHECKING:
     from dynslam_bench.segmentation.schedule import MaskScheduler
@@ -112,7 +113,7 @@ class SlamPipeline:
     Args:
         extractor: Extracts the keypoints; a `MaskedExtractor` extracts enough of them outside the
             dynamic mask.
-        masks: Segmentation stage; None for systems without semantics.
+        mask_scheduler: Segmentation stage; None for systems without semantics.
         filters: Dynamic feature filters in the order of application.
         flow: Flow of the keypoints that are left to the previous image; run before the first filter
             that needs it.
@@ -134,10 +135,10 @@ class SlamPipeline:
         self,
         *,
         extractor: FeatureExtractor,
-        masks: MaskScheduler | None,
+        mask_scheduler: MaskScheduler | None,
         filters: Sequence[DynamicFilter],
         flow: FlowEstimator | None,
-        backend: RgbdBackend,
+        backend: Backend,
         refine_prediction: RefinePrediction | None = None,
         settings: Settings,
         cached: Mapping[str, CachedStage] | None = None,
@@ -146,7 +147,7 @@ class SlamPipeline:
         if needing and flow is None:
             raise TrackerError(f"filter '{needing[0]}' needs an optical flow, the system has none")
         self._extractor = extractor
-        self._masks = masks
+        self._mask_scheduler = mask_scheduler
         self._filters = tuple(filters)
         if flow is not None and refine_prediction is None:
             raise TrackerError(
@@ -166,7 +167,7 @@ class SlamPipeline:
         self._camera = camera
         self._seed = derive_seed(rng)
         self._backend.reset(camera, seed=self._seed)
-        for part in (*self._filters, self._masks):
+        for part in (*self._filters, self._mask_scheduler):
             if part is not None and hasattr(part, "reset"):
                 part.reset(camera)
         self._previous: PreviousFrame | None = None
@@ -219,8 +220,8 @@ class SlamPipeline:
 
         # report; a detector in a thread of its own is not a part of the frame's time
         timings = clock.seconds | dict(result.timings)
-        if self._masks is not None and self._masks.beside_s:
-            timings["detector"] = self._masks.beside_s
+        if self._mask_scheduler is not None and self._mask_scheduler.async_segmenter_s:
+            timings["detector"] = self._mask_scheduler.async_segmenter_s
         stats = self._stats(bundle, state, filter_result, result)
         return TrackResult(
             result.T_world_cam,
@@ -242,11 +243,11 @@ class SlamPipeline:
         clock: StageClock,
     ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
         """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none."""
-        if self._masks is None:
+        if self._mask_scheduler is None:
             return None, None
         mask = None
         with clock("segmentation"):
-            instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
+            instances = self._mask_scheduler.masks_for(frame, gray, keyframe=self._keyframe_due)
             if self._segmentation is not None and instances.class_names:
                 mask = dynamic_mask(instances, self._segmentation, depth)
         return instances, mask
@@ -257,21 +258,25 @@ class SlamPipeline:
         """Keypoints, and their undistorted pixels ``[N, 2]``."""
         extractor = self._extractor
         with clock("features"):
+            # a narrow image is enlarged
+            image = enlarged(gray)
             if (
                 mask is not None
                 and self._segmentation is not None
                 and isinstance(extractor, MaskedExtractor)
             ):
-                keypoints = extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+                share = self._segmentation.outside_share
+                keypoints = extractor.extract_masked(image, enlarged_mask(mask), share)
             else:
-                keypoints = extractor.extract(gray)
+                keypoints = extractor.extract(image)
+            keypoints = in_given_image(keypoints, gray)
             xy = self._camera.undistort_points(keypoints.xy)
         return keypoints, xy
 
     def _filter_state(self, frame: FrameBundle) -> FilterState:
-        """What filters may read beside the frame: the previous frame, the prediction and the map."""
+        """State that filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
-        T_world_pred, covariance = self._backend.predict(frame.timestamp)
+        T_world_pred, covariance = self._backend.predict_T_world_cam(frame.timestamp)
         keyframes, map_points = self._backend.view()
         return FilterState(
             camera=self._camera,
@@ -312,16 +317,16 @@ class SlamPipeline:
                 stats[f"{dynamic_filter.name}_{key}"] = value
 
         # the starvation guard sets the last filters aside while too few keypoints would be left
-        keep, undone, returned = self._guarded(frame, verdicts)
-        stats["guard_undone"] = float(undone)
-        stats["guard_returned"] = float(np.count_nonzero(returned))
+        keep, n_set_aside, restored = self._guarded(frame, verdicts)
+        stats["guard_undone"] = float(n_set_aside)
+        stats["guard_returned"] = float(np.count_nonzero(restored))
 
         # weights multiply and masks join, of the filters that count; what is given back counts in full
-        counted = verdicts[: len(verdicts) - undone]
+        counted = verdicts[: len(verdicts) - n_set_aside]
         weight = np.ones(len(frame.xy), np.float32)
         for verdict in counted:
             weight *= verdict.weight
-        weight[returned] = 1
+        weight[restored] = 1
         masks = [verdict.mask for verdict in counted if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
         return FilterResult(keep, weight, stats, mask), image
@@ -336,21 +341,21 @@ class SlamPipeline:
         """
         total = len(frame.xy)
         needed = self._guard.needed(total)
-        keep, undone = combine_verdicts([verdict.keep for verdict in verdicts], total, needed)
-        returned = np.zeros(total, bool)
+        keep, n_set_aside = combine_verdicts([verdict.keep for verdict in verdicts], total, needed)
+        restored = np.zeros(total, bool)
 
         # the first verdict leaves enough, or there is no mask that tells which keypoints are the least doubtful
-        if undone < len(verdicts) or not verdicts:
-            return keep, undone, returned
+        if n_set_aside < len(verdicts) or not verdicts:
+            return keep, n_set_aside, restored
         first = verdicts[0]
         mask = first.mask if frame.mask is None else frame.mask
         if mask is None:
-            return keep, undone, returned
+            return keep, n_set_aside, restored
 
         # masked keypoints are given back to a camera that is tracked; no map begins with them
         if self._backend.state == "ok":
-            returned = least_masked(first.keep, mask, frame.keypoints.xy, needed)
-        return first.keep | returned, len(verdicts) - 1, returned
+            restored = least_masked(first.keep, mask, frame.keypoints.xy, needed)
+        return first.keep | restored, len(verdicts) - 1, restored
 
     def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Compute the flow to the previous image and the pose that it predicts.
@@ -399,8 +404,8 @@ class SlamPipeline:
         flow_stats = {} if state.flow is None else state.flow.stats
         for name in getattr(self._flow, "stats_names", ()):
             stats[f"flow_{name}"] = flow_stats.get(name, 0.0)
-        if self._masks is not None:
-            stats["segmented"] = float(self._masks.segmented)
+        if self._mask_scheduler is not None:
+            stats["segmented"] = float(self._mask_scheduler.segmented)
         if self._cached:
             stats["cached_stages"] = float(sum(stage.hit for stage in self._cached.values()))
         return stats
@@ -439,8 +444,8 @@ class SlamPipeline:
 
     def close(self) -> None:
         """Wait for the segmenter beside tracking."""
-        if self._masks is not None:
-            self._masks.settle()
+        if self._mask_scheduler is not None:
+            self._mask_scheduler.wait_for_segmenter()
 
     def configure(self, settings: Settings) -> None:
         """Put other values of online settings into force from the next frame on; `reset` undoes it.
@@ -460,7 +465,7 @@ class SlamPipeline:
             for group in getattr(dynamic_filter, "groups", (dynamic_filter.name,)):
                 parts.append((group, dynamic_filter))
         parts.append(("features", self._extractor))
-        parts.append(("segmentation", self._masks))
+        parts.append(("segmentation", self._mask_scheduler))
         parts.append(("flow", self._flow))
         parts.append(("backend", self._backend))
         for group, part in parts:
@@ -472,7 +477,7 @@ class SlamPipeline:
         if self._segmentation is not None:
             yield "segmentation", partial(setattr, self, "_segmentation")
 
-    def _started(self) -> RgbdBackend:
+    def _started(self) -> Backend:
         """The back end.
 
         Raises:
@@ -507,10 +512,10 @@ def combine_verdicts(
         The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside
         every feature is kept.
     """
-    for undone in range(len(verdicts)):
-        keep = np.logical_and.reduce(verdicts[: len(verdicts) - undone])
+    for n_set_aside in range(len(verdicts)):
+        keep = np.logical_and.reduce(verdicts[: len(verdicts) - n_set_aside])
         if np.count_nonzero(keep) >= needed:
-            return keep, undone
+            return keep, n_set_aside
     return np.ones(total, dtype=bool), len(verdicts)
 
 
@@ -533,9 +538,9 @@ def least_masked(
     # as many of the dropped ones as are missing
     dropped = np.flatnonzero(~keep)
     nearest = dropped[np.argsort(masked_px[dropped], kind="stable")]
-    returned = np.zeros(len(keep), bool)
-    returned[nearest[: max(0, needed - int(np.count_nonzero(keep)))]] = True
-    return returned
+    restored = np.zeros(len(keep), bool)
+    restored[nearest[: max(0, needed - int(np.count_nonzero(keep)))]] = True
+    return restored
 
 
 def flow_to_previous(
@@ -583,7 +588,7 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     current_points = camera.unproject(frame.xy[has_depth], frame.z[has_depth])
     points = current_points @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
 
-    # their projections
+    # where they appear in the previous image, unless they would lie behind its camera
     ahead = points[:, 2] > MIN_PREDICTED_DEPTH_M
     rows = np.flatnonzero(has_depth)[ahead]
     guess[rows] = camera.distort_points(camera.project(points[ahead]))

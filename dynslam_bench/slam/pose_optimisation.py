@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.ordering import median
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.gauss_newton import (
     add_normal_equation,
@@ -117,10 +118,18 @@ class PoseEstimate:
 def cauchy_width(chi2: Array) -> float:
     """Squared width of Cauchy's kernel for observations with these chi-squares.
 
-    Their variance over the assumed one is estimated by the median of those in front of the camera.
+    Their variance over the assumed one is estimated by the median of those that are finite (of
+    points in front of the camera).
     """
-    finite = chi2[np.isfinite(chi2)]
-    return CAUCHY * (max(np.median(finite) / MEDIAN_CHI2, LEAST_VARIANCE) if len(finite) else 1.0)
+    finite = np.empty(len(chi2))
+    count = 0
+    for value in chi2:
+        if np.isfinite(value):
+            finite[count] = value
+            count += 1
+    if count == 0:
+        return CAUCHY
+    return CAUCHY * max(median(finite[:count]) / MEDIAN_CHI2, LEAST_VARIANCE)
 
 
 @kernel
@@ -259,8 +268,12 @@ def _classify(
     camera: Intrinsics,
     inlier: NDArray[np.bool_],
     error: Array,
-) -> None:
-    """Fill which observations fit, ``[N]``, and their reprojection errors ``[N]`` in standard deviations."""
+) -> int:
+    """Fill which observations fit, ``[N]``, and their reprojection errors ``[N]`` in standard deviations.
+
+    Returns how many fit.
+    """
+    count = 0
     for i in range(points.shape[0]):
         pixel, whole = observation_chi2(
             pose,
@@ -273,6 +286,8 @@ def _classify(
         )
         error[i] = np.sqrt(pixel)
         inlier[i] = whole <= (CHI2_DEPTH if measured.info_right[i] > 0.0 else CHI2_MONO)
+        count += inlier[i]
+    return count
 
 
 @kernel
@@ -287,15 +302,20 @@ def _optimise(
     """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``."""
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))
+    chi2 = np.empty(len(points))
     h = np.zeros((6, 6))
     g = np.zeros(6)
     for number in range(rounds):
         # Huber's kernel, and in the last round Cauchy's, as wide as the inliers' residuals
-        width = cauchy_width(error[inlier] ** 2) if number == rounds - 1 else 0.0
+        width = 0.0
+        if number == rounds - 1:
+            for i in range(len(points)):
+                chi2[i] = error[i] * error[i] if inlier[i] else np.inf
+            width = cauchy_width(chi2)
         damping = DAMPING
         cost = _linearise(pose, points, measured, inlier, width, camera, h, g)
         for _ in range(iterations):
-            # damped step
+            # a step of Levenberg and Marquardt: the damping grows the diagonal
             work = h.copy()
             for m in range(6):
                 work[m, m] += damping * h[m, m] + 1e-9
@@ -322,8 +342,8 @@ def _optimise(
                 if damping > MOST_DAMPING:
                     break
         # sort all points into inliers and outliers again
-        _classify(pose, points, measured, camera, inlier, error)
-        if inlier.sum() < MIN_POINTS:
+        count = _classify(pose, points, measured, camera, inlier, error)
+        if count < MIN_POINTS:
             break
     return pose, inlier, error, h
 

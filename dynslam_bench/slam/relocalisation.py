@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.features.matching import Words, match_brute_force
-from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry import Camera, feature_scale, pixel_index, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
@@ -115,9 +115,9 @@ not connected with it: the camera was kidnapped."""
 CONNECTED = 20
 """Matches that must fit one homography to connect two images."""
 CONNECTED_SHARE = 0.4
-"""Their share of all matches, at least."""
+"""Least share of these matches among all."""
 HOMOGRAPHY_PX = 4.0
-"""Largest error of these matches, pixels."""
+"""Largest error of these matches, pixels of octave 0."""
 ROTATION_SLACK = np.radians(20.0)
 """Largest error of the rotation is this angle, radians, plus `ROTATION_SLACK_SHARE`."""
 ROTATION_SLACK_SHARE = 0.75
@@ -393,7 +393,7 @@ def verify_place(
     matches = candidate.matches
 
     # match the points around and fit the pose, while that gives more inliers
-    points = slam_map.points_of(around(slam_map, keyframe))
+    points = slam_map.points_of(keyframe_neighbourhood(slam_map, keyframe))
     estimate = solve(slam_map.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
         count = len(matches)
@@ -414,13 +414,13 @@ def verify_place(
         # the distortion is less than what masks are dilated by
         pixels, _ = pixel_index(uv, observations.mask.shape)
         in_view = in_view[~observations.mask[pixels]]
-    share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
+    seen_share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
 
     # depth of the place, which distances there are compared with
     depth = np.nan
     if len(matches):
         depth = float(np.median(se3.transform(T_cam_world, matches.position)[:, 2]))
-    return InitialPose(T_cam_world, matches, keyframe, share, depth)
+    return InitialPose(T_cam_world, matches, keyframe, seen_share, depth)
 
 
 def recognise_place(
@@ -493,7 +493,7 @@ def pose_uncertainty(
     return worst if np.isfinite(worst) else np.inf
 
 
-def around(slam_map: Map, keyframe: int) -> Slots:
+def keyframe_neighbourhood(slam_map: Map, keyframe: int) -> Slots:
     """Slots of a keyframe, first, and of those that share most points with it."""
     near, _ = slam_map.covisible(keyframe)
     return np.concatenate([[keyframe], near[:AROUND]]).astype(np.int64)
@@ -502,7 +502,7 @@ def around(slam_map: Map, keyframe: int) -> Slots:
 # ---------------------------------------------------------------------- perceptual aliasing
 
 
-def contradict(one: InitialPose, other: InitialPose) -> bool:
+def are_different_places(one: InitialPose, other: InitialPose) -> bool:
     """Whether a frame cannot have been taken at both places."""
     between = one.T_cam_world @ se3.inverse(other.T_cam_world)
     far = np.linalg.norm(between[:3, 3]) > SAME_PLACE_DEPTHS * max(one.depth, other.depth)
@@ -523,13 +523,14 @@ def is_aliased(
     Args:
         slam_map: The map.
         observations: The features.
-        hypotheses: The frame's pose by submap, as far as it is known.
-        keyframes: Slots of the keyframes whose places may be others.
+        hypotheses: Known poses of the frame: submap number to pose.
+        keyframes: Slots of the keyframes that are searched for a second place.
         settings: Settings of tracking.
         seed: Seed of RANSAC's draws.
-        possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
+        possible: Called with a submap's number and ``T_cam_world``; False where the camera cannot be
+            (`MotionBound.admits`).
     """
-    min_share = ALIASING_SHARE * max(place.share for place in hypotheses.values())
+    min_share = ALIASING_SHARE * max(place.seen_share for place in hypotheses.values())
     for submap in np.unique(slam_map.kf_map[keyframes]).tolist():
         places = [hypotheses[submap]] if submap in hypotheses else []
         slots = keyframes[slam_map.kf_map[keyframes] == submap]
@@ -547,13 +548,13 @@ def is_aliased(
             if (
                 other is None
                 or len(other.matches) < MIN_ALIASING_MATCHES
-                or other.share < min_share
+                or other.seen_share < min_share
                 or not possible(submap, other.T_cam_world)
             ):
                 continue
 
             # the same place seen from another keyframe does not contradict
-            if any(contradict(place, other) for place in places):
+            if any(are_different_places(place, other) for place in places):
                 return True
             places.append(other)
     return False
@@ -568,7 +569,8 @@ class RotationEstimate:
 
     Attributes:
         observations: Features of the newest image.
-        R_now_last: From the camera's axes in the last tracked frame to those of now, ``[3, 3]``.
+        R_now_last: Rotation ``[3, 3]`` from the camera's axes in the last tracked frame to those
+            now.
         apparent: Sum of the rotations between consecutive images, radians.
     """
 
@@ -594,7 +596,8 @@ class RotationEstimate:
             return None
         xy_before = self.observations.xy[row_before]
         xy_now = observations.xy[row_now]
-        homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
+        tolerance_px = HOMOGRAPHY_PX * feature_scale(camera.width)
+        homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, tolerance_px)
         fits = np.zeros(len(row_before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(row_before)):
             return None
@@ -625,7 +628,7 @@ class RotationEstimate:
 
         Args:
             T_last_world: World-to-camera pose ``[4, 4]`` in the last tracked frame.
-            T_now_world: That of now.
+            T_now_world: World-to-camera pose ``[4, 4]`` now.
             more: How far the two worlds may be rotated against each other, radians.
         """
         difference = T_now_world @ se3.inverse(self.applied(T_last_world))
@@ -806,7 +809,7 @@ class PoseSearch:
             return weak
         return pose
 
-    def in_root_map(self) -> InitialPose | None:
+    def pose_in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
         root_map = self.bound.atlas.map.submap(0)
         pose = replace(self, keyframes=root_map, lost=True)._relocalise(MIN_MATCHES)
@@ -849,7 +852,7 @@ class PoseSearch:
         # most of what should be in view is seen
         place = verify_place(slam_map, candidate, observations, settings.tracking)
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
-        if place.share < factor * settings.relocalisation.min_share:
+        if place.seen_share < factor * settings.relocalisation.min_share:
             return None
         if not self.lost:
             return replace(place, uncertainty=0.0)

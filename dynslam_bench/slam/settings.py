@@ -277,7 +277,7 @@ class TwoViewSettings(Settings):
         100.0,
         ge=1,
         le=1000,
-        description="search window around the last position of a feature, pixels",
+        description="search window around the last position of a feature, pixels of octave 0",
     )
     min_matches: int = Field(
         100,

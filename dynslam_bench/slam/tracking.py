@@ -23,7 +23,7 @@ from dynslam_bench.slam.settings import TrackingSettings
 CLOSE_BASELINES = 40.0
 """Points nearer than this many stereo baselines are close: their depth is trusted at once (ORB-SLAM2's number)."""
 MARGIN_PX = 8.0
-"""Points of the last frame are matched up to this distance outside the image."""
+"""Points of the last frame are matched up to this distance outside the image, at octave 0."""
 LAST_FRAME_RATIO = 0.9
 """Largest ratio of nearest to second nearest descriptor distance in the search of the last frame's points."""
 MAP_RATIO = 0.85
@@ -75,7 +75,7 @@ def observe_points(observations: Observations, features: Slots, points: Slots) -
 
     Args:
         observations: The frame's N features.
-        features: Those that observe a point, ``[M]``.
+        features: Indices of the features that observe a point, ``[M]``.
         points: Slots of their points, ``[M]``; -1 for none.
     """
     observed = np.full(len(observations), -1, np.int64)
@@ -122,7 +122,7 @@ class InitialPose:
         matches: The matches that agree.
         keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's
             reference.
-        share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN
+        seen_share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN
             if not verified.
         depth: Median depth of the matches' points; NaN if not verified.
         uncertainty: `relocalisation.pose_uncertainty`; NaN if not verified.
@@ -133,7 +133,7 @@ class InitialPose:
     T_cam_world: Array
     matches: Matches
     keyframe: int
-    share: float = np.nan
+    seen_share: float = np.nan
     depth: float = np.nan
     uncertainty: float = np.nan
     relocalised: bool = True
@@ -249,7 +249,7 @@ def match_last_frame(
 
     # their projections into the new frame
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
-    uv, inside = camera.view(local, MARGIN_PX)
+    uv, inside = camera.view(local, MARGIN_PX * slam_map.scales[0])
     rows = rows[inside]
     position = position[inside]
     uv = uv[inside]

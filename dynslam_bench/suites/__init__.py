@@ -56,7 +56,7 @@ class Suite(Record):
     Attributes:
         name: Its name.
         title: One line for reports.
-        description: What it is for.
+        description: Purpose of the suite.
         trackers: Ids, ``id:value``, ``module:Attr`` or ``file.py:Attr``.
         optional: Trackers that take part only where the packages they need are installed.
         sequences: Ids or folders.
@@ -114,9 +114,9 @@ class Suite(Record):
             device: Device of all runs.
             threads: Threads of a run in place of the suite's.
             trackers: Only these trackers of the suite, or others in place of them.
-            seeds: In place of the suite's seeds.
-            offsets: In place of the suite's start offsets.
-            frames: In place of the suite's frames.
+            seeds: Seeds in place of the suite's.
+            offsets: Start offsets in place of the suite's.
+            frames: Frames in place of the suite's, ``(start, stop)``.
             snapshots: See `RunSpec.snapshots`.
 
         Raises:

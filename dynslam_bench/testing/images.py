@@ -95,7 +95,7 @@ def check_keypoints(
 
     Args:
         keypoints: The extractor's result.
-        shape: Of the image, ``(H, W)``.
+        shape: Shape of the image, ``(H, W)``.
         descriptor_bytes: The length that the spec states, if it is known.
 
     Raises:
@@ -345,8 +345,8 @@ def check_segmenter(
 
     Args:
         construct: Builds a segmenter.
-        sequence: Whose frames to segment; the built-in scene by default.
-        frames: How many.
+        sequence: Sequence whose frames are segmented; the built-in scene by default.
+        frames: Number of frames.
 
     Raises:
         ConformanceError: Names every failed check, the fault and the likely cause.

@@ -27,7 +27,7 @@ class Finding:
     Attributes:
         part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder``,
             ``plug-in`` or ``device``.
-        name: Which.
+        name: Name of the thing.
         state: Its version, place or fault.
         missing: Whether it is not there; what works without it is no fault.
         hint: How to get what is missing.

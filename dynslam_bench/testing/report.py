@@ -142,7 +142,7 @@ def require_equal(
 
     Args:
         first: A result.
-        second: The other one.
+        second: The result that it is compared with.
         names: Attributes that are compared.
         fault: What is there in place of equal results.
         cause: The likely cause.

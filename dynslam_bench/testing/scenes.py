@@ -143,8 +143,8 @@ def draw(
     )
     ray_x, ray_y, ray_z = np.moveaxis(rays @ pose[:3, :3].T, -1, 0)
 
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x in metres: depth along each ray; the nearer one is
-    # seen
+    # depth along each ray of the walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x in metres; the nearer
+    # wall is seen
     walls = [
         (2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)
     ]
@@ -182,7 +182,13 @@ def _texture(size: int = 512) -> NDArray[np.float64]:
 def _sample(
     texture: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Colours at metres (x, y), bilinear, 250 texels a metre."""
+    """Colours ``[..., 3]`` of a wall, bilinear, 250 texels a metre.
+
+    Args:
+        texture: ``[S, S, 3]``, repeated.
+        x: Metres along the wall, any shape.
+        y: Metres, of the same shape.
+    """
     size = len(texture)
     x = x * 250
     y = y * 250

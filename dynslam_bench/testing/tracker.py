@@ -138,7 +138,7 @@ class _Runner:
     Args:
         report: Gets a sign of life with each frame.
         subject: A spec, or a function that constructs trackers.
-        settings: Of the trackers that are constructed.
+        settings: Settings of the trackers that are constructed.
         scene: What to track.
         frames: How many of its frames.
         seed: Seed of the randomness.
@@ -394,10 +394,10 @@ def _final(run: _Runner, count: int | None = None) -> None:
     # valid, and no stamp that no frame has
     _none_of(trajectory_faults(final), "finalize() gave")
     assert isinstance(final, Trajectory)
-    foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
+    wrong_stamps = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
     require(
-        not foreign,
-        f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
+        not wrong_stamps,
+        f"the final trajectory has {len(wrong_stamps)} stamps of no frame, e.g. {sorted(wrong_stamps)[:1]}",
         "stamps have to be those of the frames, unrounded",
     )
 

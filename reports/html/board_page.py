@@ -15,12 +15,12 @@ from dynslam_bench.reports.model.answers import error_columns
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
-    Cell,
+    TrackerOnSequence,
     compare_pairs,
     more_sequences,
 )
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import Interval, Scope, Standing, Verdict
+from dynslam_bench.reports.model.statistics import Interval, RankingVerdict, Scope, Standing
 from dynslam_bench.reports.tables.leaderboard import (
     error_cell,
     frame_time_cell,
@@ -32,7 +32,7 @@ from dynslam_bench.reports.tables.leaderboard import (
 )
 from dynslam_bench.reports.tables.table import TableCell
 
-_OPPOSITE: dict[Verdict, str] = {
+_OPPOSITE: dict[RankingVerdict, str] = {
     "better": "worse",
     "better, but lost": "worse, but lost fewer",
     "worse": "better",
@@ -69,9 +69,9 @@ def ranking_entries(
     successes lead to its first failure.
 
     Args:
-        board: Of the category.
-        whole: Of all sequences: the numbers of trackers.
-        boards: Of all categories, for the column that shows them side by side.
+        board: Board of the category.
+        whole: Board of all sequences, which numbers the trackers.
+        boards: Boards by category, for the column that shows them side by side.
         paged: Ids of the runs that have a page.
         monocular: Boards of trackers whose scale comes from the truth, by category.
     """
@@ -268,7 +268,7 @@ def board_data(
 
     Args:
         board: The board.
-        boards: Of its categories.
+        boards: Boards of its categories, by category.
         protocol: How errors were computed.
         paged: Ids of the runs that have a page.
         pictured: Ids of those whose pictures lie beside it.
@@ -392,7 +392,7 @@ def ratio_numbers(ratio: Interval) -> list[float | None]:
 
 
 def cell_data(
-    cell: Cell,
+    cell: TrackerOnSequence,
     tracker: int,
     sequence: int,
     metrics: Sequence[Mapping[str, str]],

@@ -16,6 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
+from dynslam_bench.reports.html.still import still
 from dynslam_bench.reports.tables.table import Table
 
 ASSETS = "assets"
@@ -33,9 +34,9 @@ class Block:
         title: Heading above it, or what is seen of it when it is closed.
         table: The table.
         figure: The figure.
-        caption: Below the figure.
-        text: The code.
-        entries: Of the list.
+        caption: Below the figure, or above the code.
+        text: The code, which a button copies.
+        entries: Entries of the list.
         folded: Whether it is closed at first, behind its title.
     """
 
@@ -91,7 +92,12 @@ def _templates() -> Environment:
     environment = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource)
     )
-    environment.filters |= {"breakable": _breakable, "script": to_script, "figure": figure_json}
+    environment.filters |= {
+        "breakable": _breakable,
+        "script": to_script,
+        "figure": figure_json,
+        "still": still,
+    }
     return environment
 
 

@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
 from dynslam_bench.core.module_graph import PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
+from dynslam_bench.evaluation.verdicts import CATASTROPHE, FLOOR_M
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
 from dynslam_bench.reports.html.page import read_remark, write_changed, write_side
@@ -27,7 +29,7 @@ from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_c
 from dynslam_bench.reports.model.summary import reservations
 from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
 from dynslam_bench.reports.tables.table import mm, significant_text
-from dynslam_bench.runs.artifacts import VIDEO_FILE
+from dynslam_bench.runs.artifacts import VIDEO_FILE, read_snapshots
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
 from dynslam_bench.runs.layout import file_stamp
@@ -44,6 +46,8 @@ FEWEST_FRAMES = 5
 """Frames below which a bin shows nothing."""
 MOST_FRAMES = 400
 """About how many frames of a run its page shows."""
+RESIDUALS = 60
+"""About how many residuals, lines from the estimate to the true position, a track shows."""
 WORST = 6
 """Frames that a page offers to jump to, those with the largest frame-to-frame error."""
 _APART = 15
@@ -56,7 +60,7 @@ _NO_STAGES = ("total_s", "processor_s", "read_s")
 
 @dataclass(frozen=True)
 class RunPage:
-    """What the report needs of a run whose page was written.
+    """Entry in the report for a run whose page was written.
 
     Attributes:
         variant_key: Its tracker and settings.
@@ -70,11 +74,25 @@ class RunPage:
     frames: list[int]
 
 
+@dataclass(frozen=True)
+class LeastError:
+    """The least error that a ranked tracker has on a sequence.
+
+    Attributes:
+        error_m: Median over the tracker's runs, in metres.
+        label: The tracker.
+    """
+
+    error_m: float
+    label: str
+
+
 def write_run_pages(
     rows: Sequence[RunRow],
     pictured: Collection[str],
     protocol: Protocol,
     output: Path,
+    least: Mapping[str, LeastError] | None = None,
     pool: WorkerPool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[RunPage]:
@@ -85,6 +103,7 @@ def write_run_pages(
         pictured: Ids of the runs whose pictures are copied.
         protocol: How errors are computed.
         output: Folder of the report.
+        least: The least error on each sequence that has one, by `RunRow.sequence_key`.
         pool: Workers that write the pages; None to write them here.
         progress: Called with the runs that are done, and all.
 
@@ -95,14 +114,15 @@ def write_run_pages(
     newest = sorted(rows, key=lambda row: row.started, reverse=True)
     newest.sort(key=lambda row: row.offset)
     shares = {}
-    for column, runs in grouped(newest, lambda row: row.column_id).items():
+    for column, runs in grouped(newest, lambda row: row.sequence_key).items():
         shares[column] = exact_shares(runs)
 
     # write the pages, those of one column after each other
     jobs = []
-    for column, runs in grouped(rows, lambda row: row.column_id).items():
+    for column, runs in grouped(rows, lambda row: row.sequence_key).items():
         for row in runs:
-            jobs.append((row, row.run_id in pictured, shares[column], protocol, output))
+            best = (least or {}).get(column)
+            jobs.append((row, row.run_id in pictured, shares[column], protocol, output, best))
     pages: list[RunPage] = []
     for page in run_jobs(pool, _write_page, jobs):
         pages.append(page)
@@ -111,7 +131,12 @@ def write_run_pages(
 
 
 def _write_page(
-    row: RunRow, pictured: bool, share: Mapping[int, float], protocol: Protocol, output: Path
+    row: RunRow,
+    pictured: bool,
+    share: Mapping[int, float],
+    protocol: Protocol,
+    output: Path,
+    least: LeastError | None,
 ) -> RunPage:
     """Write the page of a run whose frames have these exact shares of dynamic pixels.
 
@@ -122,8 +147,9 @@ def _write_page(
     files = _files(row, output)
     stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
     state = row.store.index.state(row.run_id, row.sequence.part)
-    code = [module_graph().digest([__name__], PLUMBING), protocol.digest(), *share.items()]
-    made_of = digest([code, state, stamps, files, pictured, row.notes, row.failed])
+    code = [_own_code(), protocol.digest(), *share.items()]
+    beside = None if least is None else [least.error_m, least.label]
+    made_of = digest([code, state, stamps, files, pictured, row.notes, row.failed, beside])
     earlier = read_remark(output, name)
     if earlier and earlier[0] == made_of:
         return RunPage(row.variant_key, *earlier[1:])
@@ -132,7 +158,7 @@ def _write_page(
     record = row.store.read_whole(row.run_id)
     frames = read_frames(row, share)
     pictures = _copy_pictures(row, output) if pictured else []
-    data = run_data(row, record, frames, protocol, pictures)
+    data = run_data(row, record, frames, protocol, pictures, least)
 
     # squared errors by the share of people, of the frames of a successful run with exact masks
     has_exact = (frames.share_source == EXACT) & (not row.failed)
@@ -140,6 +166,12 @@ def _write_page(
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
     write_side(output, name, data | {"files": files}, remark=[made_of, *sums])
     return RunPage(row.variant_key, *sums)
+
+
+@cache
+def _own_code() -> str:
+    """Digest of the code that pages are made by."""
+    return module_graph().digest([__name__], PLUMBING)
 
 
 def _copy_pictures(row: RunRow, output: Path) -> list[int]:
@@ -201,6 +233,7 @@ def run_data(
     frames: RunFrames,
     protocol: Protocol,
     pictures: Sequence[int] = (),
+    least: LeastError | None = None,
 ) -> dict[str, Any]:
     """Everything that the page of a run shows, as the page's script reads it.
 
@@ -212,6 +245,7 @@ def run_data(
         frames: Its frames.
         protocol: How its errors are computed.
         pictures: Frames that have a picture.
+        least: The least error on the run's sequence.
     """
     # series of numbers over the frames and along the track, and the figures that name them
     series, lost = _series(frames, pictures)
@@ -227,7 +261,7 @@ def run_data(
     for name, values in (series | track).items():
         packed_series[name] = packed(values, "i4" if name == "index" else "f4")
 
-    level, verdict = verdict_of(row, frames)
+    level, verdict = run_summary(row, frames, least)
     return {
         "id": row.run_id,
         "level": level,
@@ -243,9 +277,11 @@ def run_data(
         "notes": [*row.notes, *filter(None, [frames.fault, fault, _rotation_doubt(row)])],
         "command": run_command(row),
         "asked": command_line(row.command),
-        "log": _log(row),
+        "log": _log_tail(row),
         "pictures": list(pictures),
         "worst": _worst(frames),
+        "moment": _moment(row, frames),
+        "caption": _caption(row, pictures, lost) if series or track else [],
         "series": packed_series,
         "figures": {name: figure for name, figure in figures.items() if figure},
     }
@@ -272,8 +308,20 @@ def _stages_data(record: RunRecord) -> list[list[Any]]:
 Level = Literal["red", "amber", "green"]
 
 
-def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
-    """How a run ended, and why, in one sentence, with its level: failed, something to know, or nothing."""
+def run_summary(
+    row: RunRow, frames: RunFrames, least: LeastError | None = None
+) -> tuple[Level, str]:
+    """How a run ended, and why, in one sentence, with its level.
+
+    Red: it failed, or a camera that does not move has no larger error. Amber: frames were lost, the
+    trajectory is probably faulty, or the error is more than `CATASTROPHE` times the least on the
+    sequence.
+
+    Args:
+        row: The run.
+        frames: Its frames.
+        least: The least error on the run's sequence.
+    """
     if row.failed:
         return "red", _failure_words(row, frames)
 
@@ -284,16 +332,30 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     if score_m is not None and static_m:
         error += f", {significant_text(100 * score_m / static_m, 2)} % of a static camera's"
         if score_m >= static_m and not row.fixed_camera:
-            return "amber", f"No better than a static camera: {error}"
+            return "red", f"No better than not moving: {error}"
+    far_off = _far_off_words(score_m, least)
 
     if row.incomplete:
-        words = f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}"
+        words = f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}{far_off}"
         loss = _loss_words(row, frames)
         return "amber", f"{words}. {loss}" if loss else words
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
     tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
-    return "green", f"{tracked}: {error}"
+    return "amber" if far_off else "green", f"{tracked}: {error}{far_off}"
+
+
+def _far_off_words(score_m: float | None, least: LeastError | None) -> str:
+    """How many times the least error a run has, where that is more than `CATASTROPHE`; else empty."""
+    if score_m is None or least is None:
+        return ""
+    ratio = max(score_m, FLOOR_M) / max(least.error_m, FLOOR_M)
+    if ratio <= CATASTROPHE:
+        return ""
+    return (
+        f", {significant_text(ratio, 2)} times the least here ({mm(least.error_m)} mm, {least.label}; "
+        f"above {CATASTROPHE:g} times counts as a catastrophe)"
+    )
 
 
 def _failure_words(row: RunRow, frames: RunFrames) -> str:
@@ -381,7 +443,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
 
 
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
-    """What else is known of a run: name and text."""
+    """Rows (name, text) of the table of further numbers on a run's page; missing ones are left out."""
     # name, value, factor to the unit that is shown, unit
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
@@ -398,7 +460,7 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
     ]
 
 
-def _log(row: RunRow) -> str:
+def _log_tail(row: RunRow) -> str:
     """The end of a run's log; empty for none."""
     path = row.folder / "log.txt"
     if not path.is_file():
@@ -420,6 +482,46 @@ def _worst(frames: RunFrames) -> list[list[float | None]]:
         # its neighbours would show the same moment
         errors_m[max(at - _APART, 0) : at + _APART + 1] = np.nan
     return worst
+
+
+def _moment(row: RunRow, frames: RunFrames) -> int | None:
+    """The frame at which the page opens: the first that was lost, the last of a failed run, else the worst; or None."""
+    if not frames.columns:
+        return None
+    index = frames.columns["index"]
+    lost = np.flatnonzero(frames.columns["state"] == "lost")
+    if len(lost):
+        return int(index[lost[0]])
+    if row.failed:
+        return int(index[-1])
+    if np.isfinite(frames.errors_m).any():
+        return int(index[np.nanargmax(frames.errors_m)])
+    return int(index[0])
+
+
+def _caption(
+    row: RunRow,
+    pictures: Sequence[int],
+    lost: Sequence[tuple[float, float]],
+) -> list[str]:
+    """What is drawn in the pictures and over time, in sentences; nothing that is not there."""
+    sentences = []
+    if pictures:
+        drawn = []
+        with suppress(DynslamError):
+            _, shots = read_snapshots(row.folder)
+            if any(shot.kept.any() for shot in shots):
+                drawn.append("blue circles are static features")
+            if any(len(shot.kept) and not shot.kept.all() for shot in shots):
+                drawn.append("red crosses are dynamic ones")
+            if any(shot.packed is not None and shot.packed.any() for shot in shots):
+                drawn.append("yellow is the dynamic mask")
+        if drawn:
+            words = ", ".join(drawn)
+            sentences.append(f"{words[0].upper()}{words[1:]}.")
+    if lost:
+        sentences.append("Shaded: not tracked.")
+    return [*sentences, "Click or drag in the figure, move the slider, or press ← and →."]
 
 
 def _rotation_doubt(row: RunRow) -> str:
@@ -488,10 +590,10 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         whole = truth or estimate
         start = 0.0 if whole is None else float(whole.timestamps[0])
 
-    # the true path
+    # curves of the true path, in seconds since the start
     series: Series = {}
     if truth is not None and len(truth) > 1:
-        drawn = _of_part(row, truth)
+        drawn = _truth_of_run(row, truth)
         series = _along("true", drawn.timestamps - start, [drawn.positions, _angles(drawn, truth)])
 
     # the estimate: aligned and with its errors, where there is ground truth
@@ -500,15 +602,26 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
     error_mm = np.full(len(estimate), np.nan)
     if truth is not None and row.metrics:
         try:
-            estimate, _, errors = pose_errors(estimate, truth, protocol)
+            estimate, true_poses, errors = pose_errors(estimate, truth, protocol)
         except DynslamError as error:
             return series, str(error)
         error_mm = 1000 * errors["trans_m"]
+        series |= _residuals(estimate.positions, true_poses.positions)
     columns = [estimate.positions, _angles(estimate, truth or estimate), error_mm]
     return series | _along("track", estimate.timestamps - start, columns), ""
 
 
-def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
+def _residuals(positions: Array, true_positions: Array) -> Series:
+    """Lines from estimated to true positions ``[N, 3]`` each, thinned to about `RESIDUALS`, a gap behind each."""
+    step = max(1, -(-len(positions) // RESIDUALS))
+    starts = positions[::step]
+    ends = true_positions[::step]
+    gaps = np.full_like(starts, np.nan)
+    points = np.stack([starts, ends, gaps], axis=1).reshape(-1, 3)
+    return {f"residual_{axis}": points[:, column] for column, axis in enumerate("xyz")}
+
+
+def _truth_of_run(row: RunRow, truth: Trajectory) -> Trajectory:
     """The ground truth between the first and the last frame of the run's part; all of it where that is not known."""
     with suppress(DynslamError):
         stamps = row.store.timestamps(row.sequence.part)
@@ -530,15 +643,15 @@ def _along(name: str, stamps: Array, columns: Sequence[Array]) -> Series:
     return series
 
 
-def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dict[str, Any]:
-    """A line of a figure.
+def _line(name: str, x: str, y: str, colour: str, panel: int, **more: Any) -> dict[str, Any]:
+    """A plotly trace whose data are named series: ``"@x"``, filled in by the page, see `_series`.
 
     Args:
         name: What the legend calls it.
         x: Name of the series along the axis.
         y: Name of the series that is drawn.
         colour: Its colour.
-        axis: Number of the panel, from 1 on.
+        panel: Number of the panel, from 1 on.
         **more: Further properties of plotly's trace; ``line`` adds to colour and width.
     """
     style = {"color": colour, "width": 1.8} | more.pop("line", {})
@@ -550,7 +663,7 @@ def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dic
         "y": f"@{y}",
         "line": style,
         "xaxis": "x",
-        "yaxis": f"y{axis if axis > 1 else ''}",
+        "yaxis": f"y{panel if panel > 1 else ''}",
     }
     return trace | more
 
@@ -660,6 +773,9 @@ def _track_figure(track: Series) -> dict[str, Any]:
         )
         data.append(path | {"customdata": "@track_error", "showlegend": not measured})
 
+    if "residual_x" in track:
+        data.append(_path("residuals", "residual", {"color": COLOURS[1], "width": 1}))
+
     # seen from above and behind: the camera's y points down, its z ahead
     axes = {f"{name}axis": {"title": {"text": f"{name} (m)"}} for name in "xyz"}
     view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.7, "y": -1.4, "z": -1.8}}
@@ -679,7 +795,7 @@ def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[s
 
     Args:
         name: What the legend calls it.
-        part: First part of the names of its series: ``true`` or ``track``.
+        part: First part of the names of its series: ``true``, ``track`` or ``residual``.
         line: Its style.
         hover: What is shown where the pointer rests; empty for nothing.
     """

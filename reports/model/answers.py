@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from dynslam_bench.reports.model.board import OVERALL, Board, Cell
+from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.tables.table import mm
 from dynslam_bench.runs.rows import part_words
@@ -35,7 +35,7 @@ class TypicalError:
         median_m: Median over its sequences of the median error of each, in metres; None without
             any. A lost run counts as a static camera, or worse.
         sequences: Sequences with an error.
-        lost: Those of them that it lost.
+        lost: Sequences with an error that it lost.
         asked: Sequences that there are.
     """
 
@@ -45,7 +45,7 @@ class TypicalError:
     asked: int
 
 
-def cell_error_m(cell: Cell) -> float | None:
+def cell_error_m(cell: TrackerOnSequence) -> float | None:
     """Median error of a cell in metres; that of its final trajectories where nothing else is known."""
     if cell.median is not None:
         return cell.median

@@ -28,15 +28,15 @@ from dynslam_bench.reports.model.names import (
     name_columns,
     shortened,
 )
-from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
+from dynslam_bench.reports.model.row import RunRow, command_with, grouped, sequence_options
 from dynslam_bench.reports.model.statistics import (
     FAMILY_ERROR,
     FEWEST,
     Interval,
+    RankingVerdict,
     Scope,
     Sequences,
     Standing,
-    Verdict,
     log_medians,
     ratio_interval,
     resolution,
@@ -48,12 +48,13 @@ from dynslam_bench.runs.rows import part_words
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.sequences.families import family_of, same_path
 from dynslam_bench.sequences.tags import FIXED_CAMERA
+from dynslam_bench.sequences.thumbnails import same_frames
 
 STATIC_CAMERA = "static camera (from ground truth)"
 """What captions call the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
 """Tracker that errors are divided by where no other is asked for."""
-On = Literal["common", "all"]
+RankingBasis = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
 OVERALL = "overall"
 """The category of all sequences."""
@@ -95,14 +96,14 @@ class Board:
         rows: All rows.
         on: What trackers are ranked on.
         rank_seen: Whether cells rank whose masks come from a network that was trained on the scene.
-        columns: Column id of a row to the name of its sequence.
+        sequence_names: Sequence key of a row (`RunRow.sequence_key`) to the name of its sequence.
         trackers: Variant keys in order of standing; those of which only final trajectories are
             known stand apart.
         final_only: Variant keys of imports and batch programs of which only the final trajectory is
             known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
-        common: Those of them that the standings are taken over, each recording once.
+        common: Sequences that the standings are taken over, each recording once.
         copies: Sequence to the one before it whose true path it has: the same recording, by
             another name or with other pixels.
         short: Sequence to what is left of its name without the parts that all share.
@@ -120,16 +121,16 @@ class Board:
         standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking, from the best to the worst.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
-        no_better: Variant keys of trackers that are not ranked since they are no better than a
+        ranked_out_by_static: Variant keys of trackers that are not ranked since they are no better than a
             static camera: the geometric mean of their errors over its on the common sequences is 1
             or more.
         never_succeeded: Variant keys that never succeeded on the common sequences.
     """
 
     rows: list[RunRow]
-    on: On = "common"
+    on: RankingBasis = "common"
     rank_seen: bool = False
-    columns: dict[str, str] = field(default_factory=dict)
+    sequence_names: dict[str, str] = field(default_factory=dict)
     trackers: list[str] = field(default_factory=list)
     final_only: list[str] = field(default_factory=list)
     labels: dict[str, str] = field(default_factory=dict)
@@ -142,7 +143,7 @@ class Board:
     families: dict[str, str] = field(default_factory=dict)
     category: str = OVERALL
     unscored: list[str] = field(default_factory=list)
-    cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
+    cells: dict[str, dict[str, TrackerOnSequence]] = field(default_factory=dict)
     static_camera: dict[str, float] = field(default_factory=dict)
     reference: str | None = None
     reference_name: str = STATIC_CAMERA
@@ -150,7 +151,7 @@ class Board:
     standings: list[Standing] = field(default_factory=list)
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
-    no_better: list[str] = field(default_factory=list)
+    ranked_out_by_static: list[str] = field(default_factory=list)
     never_succeeded: list[str] = field(default_factory=list)
 
     @cached_property
@@ -216,7 +217,7 @@ class Board:
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
-        return self.columns[row.column_id]
+        return self.sequence_names[row.sequence_key]
 
     def runs(self, key: str) -> list[RunRow]:
         """All rows of a tracker."""
@@ -235,7 +236,7 @@ class Board:
         """Why a tracker is not ranked, in a few words; empty for one that is, and where nothing is known of it."""
         if key in self.ranked:
             return ""
-        if key in self.no_better:
+        if key in self.ranked_out_by_static:
             return "no better than a static camera"
         if key in self.never_succeeded:
             return "nothing succeeded"
@@ -289,7 +290,7 @@ class Board:
 
     @property
     def typical(self) -> set[str]:
-        """Ids of the runs that stand for the cells with a success and ground truth, see `Cell.typical`."""
+        """Ids of the runs that stand for the cells with a success and ground truth, see `TrackerOnSequence.typical`."""
         cells = (cell for key in self.trackers for cell in self.cells[key].values())
         return {cell.typical.run_id for cell in cells if cell.succeeded}
 
@@ -298,26 +299,42 @@ class Board:
 
         Returns:
             One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``.
-            ``string`` columns: run_id, kind (``run here``, ``imported``), tracker, label, settings
-            (what sets the variant apart, ``name=value; ...``), provenance, sequence (name of the
-            column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
-            study (of which the run is a trial), protocol_id, protocol_digest, trajectory
-            (``online``, ``final``: whose errors they are), segmentation, computer (on which the
-            times were taken), program_remark (how many programs share the row, or how the results
-            differ from those of the program that ranks).
-            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed,
-                n_tracked.
-            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache),
-                seen_in_training
-            (whether the masks come from a network that was trained on the scene). ``Float64``:
-            coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks:
-            lost frames held, failures as a static camera or worse), hold_last_pose_ate_m,
-            final_ate_m and static_camera_ate_rmse_m (metres), frame_ms (median, milliseconds),
-            real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
-            (standard error in degrees of the alignment's rotation; above 10 the metrics
-            ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under its
-            own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see
-            `Evaluation`).
+
+            ``string`` columns:
+
+            - run_id, frames, split, repeat, status, segmentation, protocol_id, protocol_digest,
+              provenance, tracker, label;
+            - kind: ``run here`` or ``imported``;
+            - settings: what sets the variant apart, ``name=value; ...``;
+            - sequence: name of the column in tables; column_id: its key;
+            - ending: how a failed run ended;
+            - study: the study of which the run is a trial;
+            - trajectory: ``online`` or ``final``, whose errors they are;
+            - computer: where the times were taken;
+            - program_remark: how many programs share the row, or how the results differ from those
+              of the program that ranks.
+
+            ``Int64`` columns: seed, offset, noise (missing for the sequence's own), n_frames,
+            n_processed, n_tracked.
+
+            ``boolean`` columns:
+
+            - ranked, failed;
+            - cached: whether stage times come from the stage cache;
+            - seen_in_training: whether the masks come from a network that was trained on the scene.
+
+            ``Float64`` columns:
+
+            - coverage and epipolar_skipped: shares, 0 to 1;
+            - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
+              or worse;
+            - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
+            - frame_ms: median, milliseconds;
+            - real_time_factor; peak_memory_mb: MB; mask_iou: 0 to 1;
+            - rotation_uncertainty_deg: standard error in degrees of the alignment's rotation; above
+              10 the metrics ``ape_rot_*`` say nothing of the tracker;
+            - every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
+              ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
         """
         # column to its type: those that all frames have, then the metrics
         metrics = sorted(
@@ -340,6 +357,7 @@ class Board:
                 "settings": "; ".join(assignments(row.variant)),
                 "provenance": row.tracker.provenance,
                 "sequence": self.sequence(row),
+                "column_id": row.sequence_key,
                 "frames": part_words(row),
                 "split": row.sequence.split,
                 "study": row.trial_of,
@@ -379,7 +397,7 @@ class Board:
 def make_board(
     rows: Sequence[RunRow],
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     *,
     rank_seen: bool = False,
 ) -> Board:
@@ -424,22 +442,22 @@ def category_boards(board: Board) -> dict[str, Board]:
         rows = [row for row in board.rows if board.sequence(row) in names]
         keys = {row.variant_key for row in rows}
         labels = {key: label for key, label in board.labels.items() if key in keys}
-        part = Board(
+        category_board = Board(
             rows,
             board.on,
             board.rank_seen,
-            board.columns,
+            board.sequence_names,
             labels=labels,
             category=category,
             asked_reference=board.asked_reference,
         )
-        boards[category] = _fill_board(part)
+        boards[category] = _fill_board(category_board)
     return boards
 
 
 def _fill_board(board: Board) -> Board:
     """Fill a board that has rows and labels: sequences, cells, ranking, reference, standings and order."""
-    # cells
+    # one cell for each tracker and sequence
     _order_sequences(board)
     by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
     board.cells = {
@@ -448,7 +466,7 @@ def _fill_board(board: Board) -> Board:
     }
     board.final_only = [key for key in board.labels if all(map(_has_final_only, board.runs(key)))]
 
-    # ranking
+    # who is ranked, beside which reference, and in which order
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
@@ -501,7 +519,7 @@ def rank(
     Args:
         board: Gives cells and reference.
         scored: Trackers to place.
-        ranked: Those of them that are ranked.
+        ranked: Trackers among `scored` that are ranked.
         score: Error of a run in metres, or None to leave it out.
     """
     # errors in metres of every tracker, by sequence
@@ -633,18 +651,18 @@ def more_sequences(board: Board, key: str) -> int | None:
     return further if further <= MOST_FURTHER else None
 
 
-class Pair(NamedTuple):
+class TrackerPair(NamedTuple):
     """Two trackers on the common sequences that both have.
 
     Attributes:
         one: Variant key of the first tracker.
-        other: That of the second.
+        other: Variant key of the second tracker.
         ratio: Geometric mean of the errors of the first over those of the second where both succeed; over all
             sequences where they succeed on none together.
         sequences: Sequences behind it.
         lost: Sequences that the first alone lost, and the second alone.
         p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
-        verdict: Of the first; empty unless both are ranked.
+        verdict: What the test says of the first tracker; empty unless both are ranked.
         scope: How far that goes.
     """
 
@@ -654,11 +672,11 @@ class Pair(NamedTuple):
     sequences: int
     lost: tuple[int, int]
     p_value: float | None
-    verdict: Verdict
+    verdict: RankingVerdict
     scope: Scope
 
 
-def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
+def compare_pairs(board: Board, keys: Sequence[str]) -> list[TrackerPair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs = common_logs(board, keys)
     succeeded = {key: without_lost(board, logs[key], board.lost(key)) for key in keys}
@@ -685,12 +703,12 @@ def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
             len(both_ran & board.lost(other) - board.lost(one)),
         )
         order = tests.get((one, other))
-        verdict: Verdict = "" if order is None else "cannot tell"
+        verdict: RankingVerdict = "" if order is None else "cannot tell"
         if order is not None and order.first_by:
             verdict = "better" if order.first_by < 0 else "worse"
         p_value = None if order is None else order.p_value
         scope: Scope = "" if order is None else order.scope
-        pairs.append(Pair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
+        pairs.append(TrackerPair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
     return pairs
 
 
@@ -723,7 +741,7 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: the true poses are the same, and the camera moves.
+    """Which sequences are others once more: the true poses are the same, or the pictures before a fixed camera.
 
     Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
@@ -741,15 +759,20 @@ def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
         if not with_truth:
             continue
         first = min(with_truth, key=lambda row: (row.imported, row.offset))
-        if (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M:
-            continue
+        is_fixed = (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M
+        is_same = _has_same_pictures if is_fixed else _is_same_path
         for other, other_row in firsts.items():
-            if _is_same_path(first, other_row):
+            if is_same(first, other_row):
                 copies[name] = other
                 break
         else:
             firsts[name] = first
     return copies
+
+
+def _has_same_pictures(row: RunRow, other: RunRow) -> bool:
+    """Whether two runs are on one recording, whose camera never moves."""
+    return same_frames(row.sequence.thumbnails, other.sequence.thumbnails)
 
 
 def _is_same_path(row: RunRow, other: RunRow) -> bool:
@@ -787,7 +810,8 @@ def copies_note(board: Board) -> str:
         return ""
     return (
         f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: equal poses, or "
-        "as many frames, the same duration, and the same error of a static camera."
+        "as many frames, the same duration, and the same error of a static camera. Before a fixed camera, "
+        "frames spread over both show the same."
     )
 
 
@@ -832,7 +856,7 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
         if not any(cells[name].success for name in considered):
             board.never_succeeded.append(key)
         elif key in competing and board.static_ratio(key) >= 1 - 1e-9:
-            board.no_better.append(key)
+            board.ranked_out_by_static.append(key)
         elif key in competing:
             board.ranked.append(key)
 
@@ -855,12 +879,12 @@ def _most_cells(sequences: Sequence[set[str]]) -> int:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TrackerOnSequence:
     """All runs of one tracker on one sequence.
 
     Attributes:
         rows: The runs, ordered by repeat.
-        kept: Those that count: of runs that differ in their seed only and have equal results, one.
+        kept: Runs that count: of runs that differ in their seed only and have equal results, one.
     """
 
     rows: tuple[RunRow, ...]
@@ -921,7 +945,7 @@ class Cell:
         return endings[0] if endings else ""
 
 
-def make_cell(rows: Sequence[RunRow]) -> Cell:
+def make_cell(rows: Sequence[RunRow]) -> TrackerOnSequence:
     """Order the runs of a cell and find the copies among them: other seeds with equal results."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
     by_input = grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported))
@@ -929,7 +953,7 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
     for of_seeds in by_input.values():
         n_results = len({_result_of(row) for row in of_seeds})
         kept += of_seeds[:1] if n_results == 1 else of_seeds
-    return Cell(tuple(ordered), tuple(kept))
+    return TrackerOnSequence(tuple(ordered), tuple(kept))
 
 
 def _result_of(row: RunRow) -> tuple[object, ...]:
@@ -994,7 +1018,7 @@ def missing_note(board: Board) -> str:
         why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
         sentences.append(f"Not ranked, since they {why}: {incomplete}.")
 
-    # the missing cells
+    # name the cells that are missing
     cells = []
     for key, names in list(missing.items())[:_MOST_MISSING]:
         others = f" and {len(names) - 4} more" if len(names) > 4 else ""
@@ -1027,7 +1051,7 @@ def missing_commands(board: Board) -> list[str]:
 
         # one command for all sequences of which the same part is run
         missing = [by_sequence[name][0] for name in names]
-        for part, rows in grouped(missing, lambda row: tuple(part_options(row))).items():
+        for part, rows in grouped(missing, lambda row: tuple(sequence_options(row))).items():
             places = [row.place or row.sequence.id for row in rows]
             commands.append(command_with(tracker, [*places, *part, *repeats]))
     return commands
@@ -1100,10 +1124,10 @@ def load_frame(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        trials: As in `build_report`.
+        trials: Whether the trials of studies count like other runs.
 
     Returns:
-        As `Board.frame`.
+        One line a run, with the columns of `Board.frame`.
 
     Raises:
         ReportError: There are no runs.
@@ -1116,7 +1140,7 @@ def load_board(
     protocol: Protocol | str = "tum-rgbd/v1",
     *,
     reference: str | None = None,
-    on: On = "common",
+    on: RankingBasis = "common",
     rank_seen: bool = False,
     trials: bool = False,
 ) -> Board:
@@ -1125,13 +1149,14 @@ def load_board(
     Args:
         results: Results folders, or a store.
         protocol: How to evaluate; SLAM is never run again for it.
-        reference: As in `make_board`.
-        on: As in `make_board`.
-        rank_seen: As in `make_board`.
-        trials: As in `build_report`.
+        reference: Tracker id that errors are divided by, see `make_board`.
+        on: Which sequences the ranking is taken over: ``common`` or ``all``, see `make_board`.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks
+            was trained on.
+        trials: Whether the trials of studies count like other runs.
 
     Raises:
-        ReportError: As `make_board`.
+        ReportError: There are no rows, they mix protocols, or no run is of the reference.
     """
     loaded = load_runs(open_stores(results), get_protocol(protocol), trials=trials)
     return make_board(loaded.rows, reference, on, rank_seen=rank_seen)

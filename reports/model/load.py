@@ -58,7 +58,7 @@ def _score_run(store: RunStore, protocol: Protocol, run_id: str) -> tuple[RunRow
         record, state = store.read_with_state(run_id)
         return make_row(store, record, protocol), state
     except DynslamError as error:
-        return f"{store.place(run_id)}: {error}"
+        return f"{store.shown_folder(run_id)}: {error}"
 
 
 def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow, str]]) -> None:
@@ -76,7 +76,7 @@ def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow,
 
 
 @dataclass
-class Loaded:
+class LoadedRuns:
     """Everything read from the stores.
 
     Attributes:
@@ -116,24 +116,24 @@ def load_for_report(
     pool: WorkerPool | None = None,
     *,
     trials: bool = False,
-) -> tuple[Loaded, Protocol]:
+) -> tuple[LoadedRuns, Protocol]:
     """Read all runs for a report in which nobody is left out.
 
     Where all runs have final trajectories only, the protocol's variant for those takes its place.
     Runs of monocular trackers are scored under its variant with Sim(3) alignment.
 
     Args:
-        stores: As in `load_runs`.
-        protocol: As in `load_runs`.
-        on_progress: As in `load_runs`.
-        pool: As in `load_runs`.
-        trials: As in `load_runs`.
+        stores: The stores.
+        protocol: How to evaluate.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
+        pool: Workers that score the runs; None to score them here.
+        trials: Whether the trials of studies count like other runs.
 
     Returns:
         The runs, and the protocol that they are scored under.
 
     Raises:
-        ReportError: As `load_runs`.
+        ReportError: There is no run at all.
     """
     scaled = PROTOCOLS.get(f"{protocol.id}-sim3")
     try:
@@ -175,13 +175,13 @@ def load_runs(
     pool: WorkerPool | None = None,
     *,
     trials: bool = False,
-) -> Loaded:
+) -> LoadedRuns:
     """Read all runs of some stores and score them under a protocol; SLAM is never run again for it.
 
     Args:
         stores: The stores.
         protocol: How to evaluate.
-        on_progress: As in `build_report`.
+        on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
         pool: Workers that score the runs; None to score them here.
         trials: Whether trials of studies count like other runs.
 
@@ -190,7 +190,7 @@ def load_runs(
     """
     # read every store: unchanged rows from its index, the others from the runs' files
     on_progress(0, None, "looking for what has changed")
-    loaded = Loaded()
+    loaded = LoadedRuns()
     everything = []
     for store in stores:
         run_ids = store.ids()

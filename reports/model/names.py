@@ -18,15 +18,17 @@ def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
     by camera, content and frames: ``chess/seq-01`` and ``fire/seq-01``.
 
     Returns:
-        Column id (see `RunRow.column_id`) to its name.
+        Column id (see `RunRow.sequence_key`) to its name.
     """
     plainest = sorted(
         rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r))
     )
-    columns = [of_column[0] for of_column in grouped(plainest, lambda row: row.column_id).values()]
+    columns = [
+        of_column[0] for of_column in grouped(plainest, lambda row: row.sequence_key).values()
+    ]
     names: dict[str, str] = {}
     for name, group in grouped(columns, _name).items():
-        names |= _distinct(name, {row.column_id: row for row in group})
+        names |= _distinct(name, {row.sequence_key: row for row in group})
     return names
 
 

@@ -21,15 +21,15 @@ from dynslam_bench.runs.validity import Installation
 FEWEST_EQUAL = 5
 """Results that two programs must have in common, and all equal, to share a row."""
 CLOCKS_DIFFER = timedelta(minutes=10)
-"""By so much the clocks of two machines may differ. What started later than that lies in the future."""
+"""Largest difference between the clocks of two machines. A run that started later than that lies in the future."""
 CODE = "code"
 LIBRARIES = "libraries"
 WEIGHTS = "weights"
 
-Part = tuple[str, str]
+ProgramComponent = tuple[str, str]
 """`CODE`, `LIBRARIES` or `WEIGHTS`, and the name of one part of a program."""
 Repeat = tuple[str, tuple[int, int, int, str]]
-"""A column and the repeat in it, see `RunRow.column_id` and `RunRow.repeat_key`."""
+"""A column and the repeat in it, see `RunRow.sequence_key` and `RunRow.repeat_key`."""
 Result = tuple[str, tuple[tuple[str, str], ...]]
 """How a run ended, and the checksums of its trajectories."""
 Preference = tuple[bool, bool, bool, float, str]
@@ -46,7 +46,7 @@ class Program:
     """
 
     rows: list[RunRow]
-    parts: dict[Part, str]
+    parts: dict[ProgramComponent, str]
     changed: str
 
     @property
@@ -80,7 +80,7 @@ class ProgramRow:
             self.programs.append(program)
             for row in program.rows:
                 self.is_deterministic &= row.tracker.deterministic and not row.realtime
-                results = self._results.setdefault((row.column_id, row.repeat_key), {})
+                results = self._results.setdefault((row.sequence_key, row.repeat_key), {})
                 results.setdefault(_result_of(row), row)
 
     @property
@@ -88,15 +88,15 @@ class ProgramRow:
         """Whether the ids of its runs tell what it is."""
         return self.programs[0].is_verified
 
-    def values(self) -> dict[Part, list[str]]:
+    def values(self) -> dict[ProgramComponent, list[str]]:
         """Digests or versions of every part of its programs, sorted."""
-        of_part: dict[Part, set[str]] = {}
+        of_part: dict[ProgramComponent, set[str]] = {}
         for program in self.programs:
             for part, value in program.parts.items():
                 of_part.setdefault(part, set()).add(value)
         return {part: sorted(values) for part, values in sorted(of_part.items())}
 
-    def outcomes(self, other: "ProgramRow") -> Iterator["Outcome"]:
+    def outcomes(self, other: "ProgramRow") -> Iterator["RunAgreement"]:
         """How each run compares with that of another row, of all runs that both have; copies are left out.
 
         Copies are runs that differ in their seed only and have one result: they count once, as in a
@@ -113,12 +113,12 @@ class ProgramRow:
                 compared.add(pair)
                 yield _compare_results(results, other_results)
 
-    def compare(self, other: "ProgramRow") -> "Agreement":
+    def compare(self, other: "ProgramRow") -> "RowAgreement":
         """Count the outcomes of all runs that both rows have."""
         outcomes = list(self.outcomes(other))
         equal = sum(outcome.verdict == "equal" for outcome in outcomes)
         different = sum(outcome.verdict == "different" for outcome in outcomes)
-        return Agreement(
+        return RowAgreement(
             equal, different, [outcome.ratio for outcome in outcomes if outcome.ratio is not None]
         )
 
@@ -144,7 +144,7 @@ class ProgramRow:
         makers: dict[Repeat, set[int]] = {}
         for at, program in enumerate(self.programs):
             for row in program.rows:
-                makers.setdefault((row.column_id, row.repeat_key), set()).add(at)
+                makers.setdefault((row.sequence_key, row.repeat_key), set()).add(at)
         shared = set()
         for repeat, programs in makers.items():
             column, (offset, noise, _, _) = repeat
@@ -154,7 +154,7 @@ class ProgramRow:
         return len(shared)
 
 
-class Outcome(NamedTuple):
+class RunAgreement(NamedTuple):
     """One run of two programs.
 
     Attributes:
@@ -167,7 +167,9 @@ class Outcome(NamedTuple):
     ratio: float | None
 
 
-def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, RunRow]) -> Outcome:
+def _compare_results(
+    first: Mapping[Result, RunRow], second: Mapping[Result, RunRow]
+) -> RunAgreement:
     """Compare what two programs made of one request; each may have several results."""
     # the ratio of their errors; errors below the floor count as equal to it
     error_m = next(iter(first.values())).score_m
@@ -179,15 +181,15 @@ def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, Run
     status, checksums = next(iter(first))
     # several results of one request: it is not deterministic
     if len(first) > 1 or first.keys() != second.keys():
-        return Outcome("different", ratio)
+        return RunAgreement("different", ratio)
     if status != "ok":
-        return Outcome("", ratio)
+        return RunAgreement("", ratio)
     # without checksums nothing shows that they are equal
-    return Outcome("equal" if checksums else "different", ratio)
+    return RunAgreement("equal" if checksums else "different", ratio)
 
 
-class Agreement(NamedTuple):
-    """How the results of two rows compare, on the runs that both have; see `Outcome`.
+class RowAgreement(NamedTuple):
+    """How the results of two rows compare, on the runs that both have; see `RunAgreement`.
 
     Attributes:
         equal: Runs with equal results.
@@ -208,7 +210,7 @@ class Agreement(NamedTuple):
 
 
 @dataclass
-class Chosen:
+class ChosenRuns:
     """The rows of a report.
 
     Attributes:
@@ -223,7 +225,7 @@ class Chosen:
     not_installed: dict[str, str] = field(default_factory=dict)
 
 
-def choose_runs(rows: Iterable[RunRow]) -> Chosen:
+def choose_runs(rows: Iterable[RunRow]) -> ChosenRuns:
     """Choose one run of every column and repeat, and say which program's runs stand in which row.
 
     Of several programs the one that is installed here ranks; where none is, the one of the newest
@@ -237,7 +239,7 @@ def choose_runs(rows: Iterable[RunRow]) -> Chosen:
     # what is installed here, and the time
     installation = Installation()
     now = datetime.now(timezone.utc)
-    chosen = Chosen()
+    chosen = ChosenRuns()
     for group in grouped(rows, lambda row: row.settings_key).values():
         # runs by one program, then programs with equal results, then one run of each repeat
         programs = _find_programs(group, installation, now)
@@ -323,11 +325,11 @@ def _program_text(row: RunRow) -> str:
     return json.dumps(named, sort_keys=True, default=str)
 
 
-def _parts_of(row: RunRow) -> dict[Part, str]:
+def _parts_of(row: RunRow) -> dict[ProgramComponent, str]:
     """Digest or version of every part of the program that a run's record names."""
     if row.imported:
         return {}
-    parts: dict[Part, str] = {}
+    parts: dict[ProgramComponent, str] = {}
     for name in PROGRAM:
         kind = name if name in (LIBRARIES, WEIGHTS) else CODE
         if name != "parts":  # they name what the digests of `source` are of
@@ -375,7 +377,7 @@ def _choose_of_each_repeat(program_rows: Sequence[ProgramRow], now: datetime) ->
     for at, program_row in enumerate(program_rows):
         for program in program_row.programs:
             for row in program.rows:
-                place = (row.column_id, row.repeat_key, row.trajectory)
+                place = (row.sequence_key, row.repeat_key, row.trajectory)
                 preference = (at == 0, _preference(row, program.changed, now))
                 if place not in best or preference > best[place][0]:
                     best[place] = (preference, at, row)

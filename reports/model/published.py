@@ -97,7 +97,7 @@ def published_for(sequences: Sequence[str], protocol: Protocol | None = None) ->
     """What was published of whole sequences, a line for every system and source, the lowest ATE of a sequence first.
 
     Args:
-        sequences: Their ids.
+        sequences: Ids of the sequences.
         protocol: Only what is known to be scored alike (`scored_as`); None for everything.
 
     Returns:

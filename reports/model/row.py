@@ -17,7 +17,7 @@ from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
-from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.layout import TrajectoryKind
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.training_scenes import seen_in_training
@@ -72,7 +72,7 @@ class RunRow(RunRecord):
 
     protocol_id: str
     protocol_digest: str
-    trajectory: Which = "online"
+    trajectory: TrajectoryKind = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_metrics: dict[str, float] = Field(default_factory=dict)
     final_coverage: float | None = None
@@ -92,7 +92,7 @@ class RunRow(RunRecord):
         """Folder of the run's files."""
         return self.store.folder(self.run_id)
 
-    def estimate(self, which: Which) -> Trajectory | None:
+    def estimate(self, which: TrajectoryKind) -> Trajectory | None:
         """The run's ``online`` or ``final`` trajectory; None if there is none with a pose, or it is damaged."""
         try:
             return self.store.trajectory(self.run_id, which)
@@ -127,19 +127,19 @@ class RunRow(RunRecord):
         return self.tracker.ranked and self.start_map is None
 
     @property
-    def column_id(self) -> str:
+    def sequence_key(self) -> str:
         """Content, camera, frames and stride: one column of a table; equal for all repeats and spellings."""
         return self.sequence.block or self.sequence.part
 
     @property
     def repeat_key(self) -> tuple[int, int, int, str]:
-        """Which repeat of its cell it is; every imported file is one of its own."""
+        """Key of the repeat within its cell: offset, noise and seed; every imported file is a repeat of its own."""
         noise = -1 if self.sequence.noise is None else self.sequence.noise
         return self.offset, noise, self.seed, self.run_id if self.imported else ""
 
     @property
     def repeat(self) -> str:
-        """Which repeat it is, in words, e.g. ``seed 0, offset 2``.
+        """The repeat in words, e.g. ``seed 0, offset 2``.
 
         Of an import it is the end of its id, which tells files apart.
         """
@@ -148,7 +148,7 @@ class RunRow(RunRecord):
     @cached_property
     def variant(self) -> dict[str, Any]:
         """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
-        variant: dict[str, Any] = dict(sorted(self.asked.items()))
+        variant: dict[str, Any] = dict(sorted(self.requested_settings.items()))
         if not self.imported:
             variant |= {"device": self.device, "threads": self.threads}
         if self.realtime:
@@ -168,7 +168,10 @@ class RunRow(RunRecord):
 
     @property
     def variant_key(self) -> str:
-        """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat."""
+        """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat.
+
+        It is final only after `programs.choose_runs`, which sets `split_by`.
+        """
         if not self.split_by:
             return self.settings_key
         return f"{self.settings_key}|{json.dumps(self.split_by, sort_keys=True)}"
@@ -271,10 +274,10 @@ def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
 
 
 class ReportData(Record):
-    """What a report was made of, as it lies beside it; `compare` reads it back.
+    """Rows and protocol of a report, stored beside it; `compare` reads them back.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         title: Title of the report.
         protocol: Description of the protocol.
         reference: Tracker that errors are divided by.
@@ -402,7 +405,7 @@ def _outcome(
 def _static_camera_error(
     store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> float | None:
-    """What a static camera scores under the protocol's alignment; None without ground truth."""
+    """ATE in metres of a static camera under the protocol's alignment; None without ground truth."""
     if evaluation is not None:
         return evaluation.metrics["static_camera_ate_rmse_m"]
     with suppress(DynslamError):
@@ -456,7 +459,7 @@ def run_command(row: RunRow) -> str:
     """The command that makes a run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    words = [row.place or row.sequence.id, *part_options(row)]
+    words = [row.place or row.sequence.id, *sequence_options(row)]
     if row.seed:
         words += ["--seed", str(row.seed)]
     if row.offset:
@@ -484,7 +487,7 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
     return shlex.join(["dynslam-bench", "run", tracker, *words, *settings])
 
 
-def part_options(row: RunRow) -> list[str]:
+def sequence_options(row: RunRow) -> list[str]:
     """Its part of the sequence, and the camera that its command named, as options of the command line."""
     words = []
     if row.frames is not None:

@@ -32,7 +32,7 @@ from dynslam_bench.evaluation.verdicts import (
 Array = NDArray[np.float64]
 Cells = Mapping[str, Mapping[str, Sequence[float]]]
 """Tracker to sequence to the errors of its runs there, in metres."""
-Verdict = Literal["better", "better, but lost", "worse", "cannot tell", "reference", ""]
+RankingVerdict = Literal["better", "better, but lost", "worse", "cannot tell", "reference", ""]
 """How a tracker stands to the reference; empty for one that is not ranked."""
 Scope = Literal["", "on these families", "beyond these families", "by lost sequences"]
 """How far a verdict goes, or that losses alone show it; empty where nothing is claimed."""
@@ -58,7 +58,7 @@ class Sequences(NamedTuple):
     """The sequences of a board, in one order.
 
     Attributes:
-        names: Their names ``[S]``.
+        names: Names of the sequences ``[S]``.
         families: The family of each ``[S]``.
         weights: Weight of each family.
     """
@@ -88,7 +88,7 @@ class Sequences(NamedTuple):
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a tracker stands.
+    """Standing of a tracker on a board: its errors beside the reference, rank and verdict.
 
     Attributes:
         key: The tracker.
@@ -114,17 +114,17 @@ class Standing:
     may_be_best: bool
     mean_rank: float | None
     wins: int
-    verdict: Verdict
+    verdict: RankingVerdict
     scope: Scope
     p_value: float | None
     sequences: int
     lost: tuple[int, int] = (0, 0)
 
 
-class Claim(NamedTuple):
-    """What is claimed of a tracker beside the reference; fields as in `Standing`."""
+class RankingClaim(NamedTuple):
+    """A claim on a tracker beside the reference; fields as in `Standing`."""
 
-    verdict: Verdict
+    verdict: RankingVerdict
     scope: Scope = ""
     p_value: float | None = None
 
@@ -187,7 +187,7 @@ def standings(
 
     unordered = []
     for key, log in logs.items():
-        claim = claims.get(key, Claim(""))
+        claim = claims.get(key, RankingClaim(""))
         ran = np.isfinite(log)
         alone = (
             int((is_lost[key] & ~base_lost & ran).sum()),
@@ -240,8 +240,8 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     families alone where their scatter has `FEWEST_FREE` degrees of freedom, else there is none.
 
     Args:
-        log_ratios: Their logarithms ``[S]``.
-        sequences: Their sequences.
+        log_ratios: Natural logarithms of the ratios ``[S]``.
+        sequences: Sequences of the ratios.
     """
     tested = sequences.test(log_ratios)
     mean = float(np.exp(tested.centre))
@@ -258,11 +258,11 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     return Interval(mean, low, high)
 
 
-class Duel(NamedTuple):
+class PairTest(NamedTuple):
     """Two trackers on the sequences where both succeed, and what they lost.
 
     Attributes:
-        test: Of the log ratios of the first to the second.
+        test: Test of the log ratios, first over second.
         lost: Sequences that the first alone lost, and the second alone.
     """
 
@@ -280,12 +280,12 @@ class Duel(NamedTuple):
         return min(1.0, 2.0 * min(loses_more_p(*self.lost), loses_more_p(*self.lost[::-1])))
 
 
-def duel(log: Array, other: Array, sequences: Sequences) -> Duel:
+def pair_test(log: Array, other: Array, sequences: Sequences) -> PairTest:
     """Compare two trackers; with fewer than `FEWEST` sequences where both succeed only their losses tell.
 
     Args:
-        log: Log errors of the first ``[S]``; nan where it lost.
-        other: Those of the second.
+        log: Log errors of the first tracker ``[S]``; nan where it lost.
+        other: Log errors of the second tracker ``[S]``; nan where it lost.
         sequences: The sequences.
     """
     differences = log - other
@@ -296,7 +296,7 @@ def duel(log: Array, other: Array, sequences: Sequences) -> Duel:
     other_is_lost = ~np.isfinite(other)
     lost = int((is_lost & ~other_is_lost).sum())
     lost_by_other = int((other_is_lost & ~is_lost).sum())
-    return Duel(tested, (lost, lost_by_other))
+    return PairTest(tested, (lost, lost_by_other))
 
 
 def claims_against(
@@ -305,7 +305,7 @@ def claims_against(
     sequences: Sequences,
     lost: Mapping[str, NDArray[np.bool_]],
     base_lost: NDArray[np.bool_],
-) -> dict[str, Claim]:
+) -> dict[str, RankingClaim]:
     """Whether each tracker is better than the reference, Holm-corrected over the trackers.
 
     All claims of a board beyond its families are right together with a chance of at least 95 % (a
@@ -314,26 +314,28 @@ def claims_against(
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
-        lost: Tracker to which sequences it lost ``[S]``.
-        base_lost: Which the reference lost.
+        lost: Tracker to which sequences it lost, bool ``[S]``.
+        base_lost: Which sequences the reference lost, bool ``[S]``.
     """
-    claims = dict.fromkeys(logs, Claim("cannot tell"))
+    claims = dict.fromkeys(logs, RankingClaim("cannot tell"))
     others = [key for key, log in logs.items() if not np.array_equal(log, base)]
     if not others or len(base) < FEWEST:
         return claims
     reference = np.where(base_lost, np.nan, base)
-    duels = [duel(np.where(lost[key], np.nan, logs[key]), reference, sequences) for key in others]
-    beyond = holm([one.test.beyond_p for one in duels]).tolist()
-    these = holm([one.test.these_p for one in duels]).tolist()
-    by_losses = holm([one.loses_more_p for one in duels]).tolist()
+    pair_tests = [
+        pair_test(np.where(lost[key], np.nan, logs[key]), reference, sequences) for key in others
+    ]
+    beyond = holm([one.test.beyond_p for one in pair_tests]).tolist()
+    these = holm([one.test.these_p for one in pair_tests]).tolist()
+    by_losses = holm([one.loses_more_p for one in pair_tests]).tolist()
     for key, one, p_beyond, p_these, p_losses in zip(
-        others, duels, beyond, these, by_losses, strict=True
+        others, pair_tests, beyond, these, by_losses, strict=True
     ):
         # more losses than the reference's, beyond chance, whatever the errors are elsewhere
         if p_losses <= LOSS_ERROR:
-            claims[key] = Claim("worse", "by lost sequences", p_losses)
+            claims[key] = RankingClaim("worse", "by lost sequences", p_losses)
             continue
         if p_beyond <= FAMILY_ERROR:
             scope: Scope = "beyond these families"
@@ -342,13 +344,13 @@ def claims_against(
             scope = "on these families"
             p_value = p_these
         else:
-            claims[key] = Claim("cannot tell", "", min(p_beyond, p_these))
+            claims[key] = RankingClaim("cannot tell", "", min(p_beyond, p_these))
             continue
         if one.test.centre > 0:
-            verdict: Verdict = "worse"
+            verdict: RankingVerdict = "worse"
         else:
             verdict = "better, but lost" if one.lost[0] > one.lost[1] else "better"
-        claims[key] = Claim(verdict, scope, p_value)
+        claims[key] = RankingClaim(verdict, scope, p_value)
     return claims
 
 
@@ -357,11 +359,11 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
 
     Args:
         logs: Ranked trackers to the logarithms of their median errors ``[S]``.
-        base: Those of the reference.
+        base: Logarithms of the reference's median errors ``[S]``.
         sequences: The sequences.
 
     Returns:
-        Of a typical (median) tracker; 1 where nothing can be shown.
+        Both differences of a typical (median) tracker; 1 where nothing can be shown.
     """
     others = [log for log in logs.values() if not np.array_equal(log, base)]
     tests = [sequences.test(log - base) for log in others]
@@ -384,8 +386,8 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
     )
 
 
-class Order(NamedTuple):
-    """Which of two trackers is better.
+class PairwiseResult(NamedTuple):
+    """Result of the test of one tracker against another.
 
     Attributes:
         first_by: Below 0 where the first is shown to be better, above 0 where the second is, else 0.
@@ -398,13 +400,15 @@ class Order(NamedTuple):
     scope: Scope = ""
 
 
-def separable(logs: Mapping[str, Array], sequences: Sequences) -> dict[tuple[str, str], Order]:
+def separable(
+    logs: Mapping[str, Array], sequences: Sequences
+) -> dict[tuple[str, str], PairwiseResult]:
     """Which trackers the sequences tell apart, Holm-corrected over all pairs.
 
-    The order of all pairs that are called separable is right together with a chance of at least 95
-    %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two trackers are
-    compared where both succeed. Who is better there and lost more sequences is not called better; who lost
-    more beyond chance (McNemar's exact test) is worse.
+    The order of all pairs that are called separable is right together with a chance of at least
+    95 %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two
+    trackers are compared where both succeed. A tracker that is better there and lost more sequences
+    is not called better; one that lost more beyond chance (McNemar's exact test) is worse.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of
@@ -416,21 +420,21 @@ def separable(logs: Mapping[str, Array], sequences: Sequences) -> dict[tuple[str
     """
     pairs = list(combinations(logs, 2))
     if not pairs or len(sequences.names) < FEWEST:
-        return dict.fromkeys(pairs, Order(0.0, 1.0))
-    duels = [duel(logs[a], logs[b], sequences) for a, b in pairs]
+        return dict.fromkeys(pairs, PairwiseResult(0.0, 1.0))
+    pair_tests = [pair_test(logs[a], logs[b], sequences) for a, b in pairs]
     by_error = holm(
-        [one.test.beyond_p if sequences.can_go_beyond else one.test.these_p for one in duels]
+        [one.test.beyond_p if sequences.can_go_beyond else one.test.these_p for one in pair_tests]
     ).tolist()
-    by_losses = holm([one.difference_by_losses_p for one in duels]).tolist()
+    by_losses = holm([one.difference_by_losses_p for one in pair_tests]).tolist()
     scope: Scope = "beyond these families" if sequences.can_go_beyond else "on these families"
     orders = {}
-    for pair, one, p_error, p_losses in zip(pairs, duels, by_error, by_losses, strict=True):
+    for pair, one, p_error, p_losses in zip(pairs, pair_tests, by_error, by_losses, strict=True):
         surplus = one.lost[0] - one.lost[1]
-        orders[pair] = Order(0.0, p_error)
+        orders[pair] = PairwiseResult(0.0, p_error)
         if p_losses <= LOSS_ERROR:
-            orders[pair] = Order(float(surplus), p_losses, "by lost sequences")
+            orders[pair] = PairwiseResult(float(surplus), p_losses, "by lost sequences")
         elif p_error <= FAMILY_ERROR and one.test.centre * surplus >= 0:
-            orders[pair] = Order(one.test.centre, p_error, scope)
+            orders[pair] = PairwiseResult(one.test.centre, p_error, scope)
     return orders
 
 
@@ -463,7 +467,7 @@ def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
     """Friedman's test with Nemenyi's critical difference (Demsar 2006): ranks on every sequence, weights do not count.
 
     Args:
-        logs: As in `separable`.
+        logs: Tracker to the logarithms of its median errors ``[S]``; nan where it lost.
 
     Returns:
         The p value of all trackers being alike, and the difference above which two mean ranks are

@@ -188,7 +188,7 @@ def _resolution_words(board: Board) -> str:
 def reservations(rows: Sequence[RunRow]) -> list[str]:
     """What speaks against quoting numbers of these runs, or has to be said with them; in sentences."""
     sentences = []
-    cells = {(row.variant_key, row.column_id) for row in rows}
+    cells = {(row.variant_key, row.sequence_key) for row in rows}
     if len(cells) == len(rows):
         sentences.append(
             "One run of a tracker on a sequence: how far repeats lie apart is not known."
@@ -200,7 +200,7 @@ def reservations(rows: Sequence[RunRow]) -> list[str]:
     if any(row.sequence.id.startswith("synthetic/") for row in rows):
         sentences.append("Rendered scenes: not comparable with recordings.")
 
-    # times
+    # reservations on times
     if any(row.cached for row in rows):
         sentences.append("Frame times come from the stage cache, not from the runs.")
     computers = {row.computer for row in rows if row.frame_ms is not None}

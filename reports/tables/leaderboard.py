@@ -19,8 +19,8 @@ from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,
     Board,
-    Cell,
-    Pair,
+    TrackerOnSequence,
+    TrackerPair,
     compare_pairs,
     mean_of,
     rank,
@@ -442,7 +442,7 @@ def pair_table(board: Board) -> Table | None:
     return Table("pairs", "All pairs", caption, columns, rows)
 
 
-def _pair_cell(pair: Pair, key: str) -> TableCell:
+def _pair_cell(pair: TrackerPair, key: str) -> TableCell:
     """The ratio of one tracker of a pair to the other; coloured where the two can be told apart."""
     is_first = pair.one == key
     ratio = pair.ratio.value if is_first else 1.0 / pair.ratio.value
@@ -505,7 +505,7 @@ def computer_words(computer: str) -> str:
 
 
 def computer_note(board: Board) -> str:
-    """On which computer times were taken, and that some are of others; empty where all are of one."""
+    """A note on the computer on which times were taken, and that some are of others; empty where all are of one."""
     ended = [row for row in board.rows if not row.failed]
     others = {row.computer for row in timed(ended)} - {board.timing_computer}
     if not others:
@@ -569,7 +569,7 @@ def metric_table(
     unit: str = "RMSE, mm",
     text: Callable[[float], str] = mm,
     larger_is_better: bool = False,
-    doubt: Callable[[Cell], str] = lambda cell: "",
+    doubt: Callable[[TrackerOnSequence], str] = lambda cell: "",
 ) -> Table | None:
     """Median of any number of the runs that succeeded, by tracker and sequence; None if no run has it.
 
@@ -600,10 +600,10 @@ def metric_table(
             compared[key, sequence] = sign * cell_median
     marks = column_marks(board, compared) | doubtful
 
-    def behind(cell: Cell) -> str:
+    def behind(cell: TrackerOnSequence) -> str:
         return DOUBT * bool(doubt(cell)) + SEEN * cell.in_training
 
-    def tip(cell: Cell) -> str:
+    def tip(cell: TrackerOnSequence) -> str:
         return doubt(cell) or (SEEN_NOTE if cell.in_training else cell.ending)
 
     return _sequence_table(
@@ -633,8 +633,8 @@ def _sequence_table(
     brief: str,
     *,
     text: Callable[[float], str] = mm,
-    behind: Callable[[Cell], str] = lambda cell: "",
-    tip: Callable[[Cell], str] = lambda cell: "",
+    behind: Callable[[TrackerOnSequence], str] = lambda cell: "",
+    tip: Callable[[TrackerOnSequence], str] = lambda cell: "",
     marks: Mapping[str, Mapping[tuple[str, str], Emphasis]] | None = None,
 ) -> Table:
     """A table with a row a tracker that has any of the numbers, and a column a sequence and kind of number.
@@ -848,7 +848,7 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
     )
 
 
-def _final_doubt(cell: Cell) -> str:
+def _final_doubt(cell: TrackerOnSequence) -> str:
     """Why the error of a final trajectory says little: it lacks poses of frames that were tracked."""
     # share of the tracked frames with a pose in the final trajectory, by run
     shares = []
@@ -976,7 +976,7 @@ def mask_quality(board: Board) -> Table | None:
     )
 
 
-def _rotation_doubt(cell: Cell) -> str:
+def _rotation_doubt(cell: TrackerOnSequence) -> str:
     """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
     uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
     if not uncertain:
@@ -1012,13 +1012,13 @@ def _ate_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual_runs:
         return TableCell("", emphasis="muted")
 
     # the number, with remarks behind it
-    no_better = board.no_better_than_static(key, sequence)
+    is_no_better = board.no_better_than_static(key, sequence)
     skipped = mean_of(row.epipolar_skipped for row in cell.rows)
     remarks = [
         _spread_words(cell),
         count,
         "" if skipped is None else f"F skipped {percent(skipped)}",
-        "no better than a static camera" if no_better else "",
+        "no better than a static camera" if is_no_better else "",
         f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
     ]
     words = mm(cell.median) + SEEN * cell.in_training
@@ -1031,14 +1031,14 @@ def _ate_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual_runs:
     if reference_m is None:
         return replace(shown, tip=coverage)
     ratio = cell.median / max(reference_m, FLOOR_M)
-    bluest = 0.0 if cell.failed or no_better else -1.0
+    bluest = 0.0 if cell.failed or is_no_better else -1.0
     tip = f"{ratio:.2f} × the reference, {coverage}"
     if cell.failed:
         tip += f"; {cell.ending}"
     return replace(shown, shade=max(shade(ratio), bluest), tip=tip)
 
 
-def _spread_words(cell: Cell) -> str:
+def _spread_words(cell: TrackerOnSequence) -> str:
     """Half the interquartile range in mm, or that there is none."""
     if len(cell.scores) > 1:
         low_m, high_m = np.percentile(cell.scores, [25, 75])
@@ -1403,6 +1403,6 @@ def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]
     return columns
 
 
-def has_lost(cell: Cell) -> bool:
+def has_lost(cell: TrackerOnSequence) -> bool:
     """Whether frames were lost in a run that succeeded: the errors of the cell are of the tracked ones only."""
     return any(row.incomplete for row in cell.kept if not row.failed)

@@ -21,7 +21,7 @@ def published_table(lines: pd.DataFrame) -> Table | None:
     """What was published of sequences, a row for every system and source; None without any.
 
     Args:
-        lines: As `published_for` gives them.
+        lines: Lines of `published_for`: one for every system and source.
     """
     if lines.empty:
         return None
@@ -68,7 +68,7 @@ def span_table(spans: pd.DataFrame) -> Table | None:
     """Between which values the published errors of one system lie; None if none has several.
 
     Args:
-        spans: As `model.published.spans` gives them.
+        spans: Lines of `model.published.spans`: one for every system with several values.
     """
     if spans.empty:
         return None

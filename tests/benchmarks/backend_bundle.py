@@ -62,7 +62,7 @@ def problem(
 
 
 def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult:
-    """The same minimisation by gtsam's Levenberg-Marquardt; all observations have depth."""
+    """Minimise the reprojection error by gtsam's Levenberg-Marquardt; all observations have depth."""
     camera = problem.camera
     lens = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
     graph = gtsam.NonlinearFactorGraph()

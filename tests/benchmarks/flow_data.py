@@ -93,7 +93,7 @@ SIMILARITIES = {
     "translation": (0, 0, 1), "scale": (1, 0, 0.3), "rotation": (0, 45, 0.3), "similarity": (0.5, 20, 0.5),
     "foreground": (0.5, 20, 0.5),
 }  # fmt: skip
-"""Of each kind of warp the largest octaves of scale and degrees of rotation, and the share of the translation."""
+"""Largest octaves of scale and degrees of rotation of each kind of warp, and the share of the translation."""
 
 
 def synthetic(kinds: tuple[str, ...], images: int) -> list[Pair]:
@@ -204,7 +204,7 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
     out.
 
     Args:
-        name: Of `RECORDINGS`.
+        name: Name of one of `RECORDINGS`.
         gaps: Frames between the two images.
         every: First images are this far apart, further for wide gaps.
     """

@@ -196,7 +196,7 @@ class Command:
     """A command and how its result is read.
 
     Attributes:
-        words: Of the command line; ``{target}`` is the folder that it writes.
+        words: Words of the command line; ``{target}`` is the folder that it writes.
         read: Gives its result.
         within: The folder in which it is given; None for the one that holds the target.
     """

@@ -31,7 +31,7 @@ from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.backend import Backend
 from dynslam_bench.slam.settings import BackendSettings
 
 SCENES = [
@@ -60,8 +60,7 @@ class Scene:
 
     Attributes:
         camera: The camera.
-        frames: Of each frame its static keypoints, their depth, and the mask of people as packed
-            bits.
+        frames: Static keypoints of each frame, their depth, and the mask of people as packed bits.
         poses: True camera-to-world poses ``[N, 4, 4]``.
         fps: Frames a second.
     """
@@ -148,7 +147,7 @@ def case(scene: Scene, kind: str, start: int) -> dict[str, object]:
     """Drive one case; a row of the table of cases."""
     path = path_of(kind, start)
     before = BEFORE[kind]
-    backend = RgbdBackend(BackendSettings())
+    backend = Backend(BackendSettings())
     backend.reset(scene.camera, 0)
     ok = np.zeros(len(path), bool)
     error = np.zeros(len(path))

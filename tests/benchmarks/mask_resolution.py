@@ -101,7 +101,7 @@ class Clip:
         self.masks = [base.masks[index] for index in range(len(base))]
 
     def resized(self, width: int, height: int) -> "Clip":
-        """The same frames in another size."""
+        """The frames in another size."""
         clip = object.__new__(Clip)
         vars(clip).update(vars(self))
         clip.camera = self.camera.resized(width, height)
@@ -116,7 +116,7 @@ class Clip:
         return clip
 
     def in_case(self, case: str) -> "Clip":
-        """The same frames with a false mask, or with a person that fills the image."""
+        """The frames with a false mask, or with a person that fills the image."""
         if case == "plain":
             return self
         clip = object.__new__(Clip)

@@ -44,11 +44,11 @@ def simulate(shape, quality, sequences, boards, seed=0):
     """What boards claim where the truth is known.
 
     Args:
-        shape: Of the scatter, see `SHAPES`.
+        shape: Shape of the scatter, see `SHAPES`.
         quality: Mean log error of each tracker ``[K]``, the best one first.
         sequences: How many sequences a board has.
         boards: How many boards.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Returns:
         For the pairs and for the best tracker: share of boards without a wrong claim; then the mean share

@@ -62,7 +62,7 @@ def share(count: int, studies: int) -> str:
 
 
 def null(studies: int, folder: Path) -> Iterable[str]:
-    """Of so many studies in which nothing is better, the shares that say what."""
+    """Shares of verdicts in studies in which nothing is better than the baseline."""
     verdicts = [verdict.value for verdict in Verdict]
     lucky = "the best trial promises a gain of 5 %, %"
     yield line(
@@ -94,7 +94,7 @@ def planted(settings: Mapping[str, Any]) -> float:
 
 
 def recovered(studies: int, folder: Path) -> Iterable[str]:
-    """Of so many studies in which a setting is better than the baseline, how many find and prove it."""
+    """Counts of studies with a setting better than the baseline: how many find it, how many prove it."""
     loss = planted({})
     optimum = {"gain": 1.5 * (0.2 / 3) ** (1 / 3)}
     yield line(

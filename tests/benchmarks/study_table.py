@@ -10,7 +10,7 @@ from dynslam_bench.tuning import StudySummary
 
 SPLITS = {"confirm": "choice", "held_out": "held out"}
 
-print("| study | settings, split | scenes | typical ATE over the baseline's | interval | losses |")
+print("| study | settings, split | scenes | typical ratio to the baseline | interval | losses |")
 print("| --- | --- | --- | --- | --- | --- |")
 for name in sys.argv[2:]:
     summary = StudySummary.read(Path(sys.argv[1]) / "studies" / name / "summary.json")

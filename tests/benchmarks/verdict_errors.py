@@ -39,8 +39,8 @@ from dynslam_bench.evaluation.verdicts import (
     MARGIN,
     ONE_SIDED,
     Verdict,
-    excluding_interval,
     hodges_lehmann,
+    interval_with_ties,
     paired_ratio,
     verdict_of,
 )
@@ -297,7 +297,7 @@ def verdicts_of_many(
     low_90, high_90 = intervals_of_many(values, is_paired & ~is_tie, 1.0 - 4.0 * level)
     for number in np.flatnonzero(is_tie.any(axis=1)):
         known = values[number, is_paired[number]]
-        _, low_90[number], high_90[number] = excluding_interval(known, 1.0 - 4.0 * level)
+        _, low_90[number], high_90[number] = interval_with_ties(known, 1.0 - 4.0 * level)
 
     # the rules
     is_claim = ~is_worse & (is_paired.sum(axis=1) >= FEWEST_SCENES)

@@ -19,6 +19,7 @@ from helpers import hostile
 from helpers.cli_program import one_line
 from helpers.envs_toys import write_folder
 from helpers.reports_fake_store import add_run
+from helpers.waiting import until
 
 from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
@@ -214,7 +215,7 @@ def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
 
     with output.progress("3 runs") as advance:
         advance(1.5, 3, "orb-slam2 on walk, frame 5 of 10")
-        hostile.until(lambda: told().count("\n") >= 2)
+        until(lambda: told().count("\n") >= 2)
     lines = told().splitlines()
     assert len(lines) >= 2
     assert lines[0].startswith("3 runs: 1.5 of 3, about ")
@@ -222,7 +223,7 @@ def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     with output.progress("report") as advance:
         heard.clear()
         advance(1280, 1500)
-        hostile.until(lambda: "\n" in told())
+        until(lambda: "\n" in told())
     assert told().startswith("report: 1280 of 1500, about ")
 
 
@@ -352,7 +353,7 @@ def test_a_signal_stops_what_would_run_for_minutes(walk, tmp_path, verb, text, n
         preexec_fn=attentive,
     )
     try:
-        hostile.until(
+        until(
             lambda: (
                 program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n"))
             ),
@@ -566,7 +567,7 @@ def test_a_faulty_tracker_fails_with_4(facts, tmp_path):
 
 
 ROWS = [
-    ["run", "tracker", "sequence", "ATE (m)", "masks"],
+    ["run", "tracker", "sequence", "ATE (mm)", "masks"],
     [
         "0123456789abcdef",
         "emfoa-oft",
@@ -674,8 +675,8 @@ def test_no_motion_of_a_fixed_camera_is_shown_and_nothing_is_worse_than_it(capsy
         runs.show_rows([row], None, "p")
         out = capsys.readouterr().out.splitlines()
         assert len(out) == 2
-        assert "ATE (m)" in out[0]
-        assert "false motion (m)" in out[0]
+        assert "ATE (mm)" in out[0]
+        assert "false motion (mm)" in out[0]
         assert "from the store" not in out[0]
 
 

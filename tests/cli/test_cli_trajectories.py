@@ -124,8 +124,11 @@ def test_lost_digits_are_told_wherever_the_file_is_read(cli, files, tmp_path, fo
     ):
         code, _, err = cli(*words)
         assert code == 1
-        assert "149 of 150 lines of" in one_line(err)
-        assert "digits were lost" in err
+        # `run` says first what it took the folder for
+        *said, error = err.splitlines(keepends=True)
+        assert len(said) == (3 if words[0] == "run" else 0)
+        assert "149 of 150 lines of" in one_line(error)
+        assert "digits were lost" in error
 
 
 # -- warnings and hints, wherever an error is shown
@@ -289,3 +292,36 @@ def test_eval_of_one_estimate_shows_every_statistic(cli, tmp_path):
     assert len(out.splitlines()) < 14
     numbers = set(out.split())
     assert [name for name, value in metrics.items() if f"{value:.4g}" not in numbers] == []
+
+
+def test_a_table_of_trajectories_is_a_board_in_one_command(cli, tmp_path):
+    """Partial trajectories keep their row, with how many sequences and how much of the time they are of."""
+    # two recordings, the second one on a path of twice the size
+    for name, size in (("a", 1.0), ("b", 2.0)):
+        write_tum(tmp_path / f"truth_{name}.txt", scaled(TRUTH, size))
+        write_tum(tmp_path / f"whole_{name}.txt", scaled(ESTIMATE, size))
+    write_tum(tmp_path / "half_a.txt", ESTIMATE.select(slice(0, len(ESTIMATE) // 2)))
+    entries = [
+        ("whole", "a", "whole_a.txt"),
+        ("whole", "b", "whole_b.txt"),
+        ("also", "a", "whole_a.txt"),
+        ("also", "b", "whole_b.txt"),
+        ("half", "a", "half_a.txt"),
+    ]
+    table = [
+        f'[[trajectory]]\ntracker = "{tracker}"\nsequence = "mine/{name}"\n'
+        f'file = "{file}"\ntruth = "truth_{name}.txt"\n'
+        for tracker, name, file in entries
+    ]
+    (tmp_path / "people.toml").write_text("\n".join(table))
+    code, out, err = cli("report", "people.toml")
+    assert code == 0, err
+    assert "5 trajectories added" in err
+    rows = [line for line in out.splitlines() if "imported)  " in line]
+    lines = {name: next(row for row in rows if name in row) for name in ("whole", "half")}
+    assert "2/2" in lines["whole"]
+    assert "1 of 2" in lines["half"]
+    assert "unknown" in lines["half"], "coverage: the frames are not known"
+    records = [path.read_text() for path in (tmp_path / "people" / "runs").glob("*/run.json")]
+    spans = {re.search(r"are (\d+) % of the ground truth's time", record)[1] for record in records}
+    assert spans == {"100", "50"}

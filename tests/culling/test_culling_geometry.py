@@ -27,14 +27,13 @@ from dynslam_bench.culling.correlation_graph import (
 )
 from dynslam_bench.culling.ego_motion import (
     CORRELATION,
-    RigidMotionFilter,
     depth_sigma,
-    failing_regions,
     prior_information,
     refine_prediction,
 )
 from dynslam_bench.culling.epipolar import EpipolarFilter, epipolar_distance, fundamental_matrix
 from dynslam_bench.culling.free_space import MAX_AGE_S, FreeSpaceFilter
+from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.multiview_depth import (
     BIN_M,
     MultiViewFilter,
@@ -42,6 +41,7 @@ from dynslam_bench.culling.multiview_depth import (
     hidden,
     refine_by_matches,
 )
+from dynslam_bench.culling.rigid_motion import RigidMotionFilter
 from dynslam_bench.culling.settings import (
     CorrelationSettings,
     EpipolarSettings,
@@ -158,6 +158,7 @@ def test_free_space_culls_what_stands_where_enough_recent_keyframes_measured_cle
     keep = (
         FreeSpaceFilter(FreeSpaceSettings(min_share=0.0, **settings)).apply(made.frame, state).keep
     )
+    # the near points of the scene
     assert keep[made.frame.z < 3.9].any() != violated
     assert keep.all() != violated
 
@@ -364,9 +365,9 @@ def test_a_region_is_the_same_share_of_an_image_of_any_size(width: int) -> None:
     failing = (np.abs(xy - (320, 240)).max(axis=1) < 60) | (rng.random(1000) < 0.05)
     tested = np.ones(1000, bool)
     scale = width / 640
-    moving = failing_regions(failing, tested, xy, 0.4, (480, 640))
+    moving = in_moving_region(failing, tested, xy, 0.4, (480, 640))
     size = round(480 * scale), width
-    np.testing.assert_array_equal(failing_regions(failing, tested, scale * xy, 0.4, size), moving)
+    np.testing.assert_array_equal(in_moving_region(failing, tested, scale * xy, 0.4, size), moving)
     assert 0 < np.count_nonzero(moving) < np.count_nonzero(failing)
 
 
@@ -375,11 +376,11 @@ def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:
     xy = rng.uniform((0, 0), (640, 480), (1000, 2))
     noise = rng.random(1000) < 0.05
     away = np.abs(xy - (320, 240)).max(axis=1)
-    moving = failing_regions((away < 60) | noise, np.ones(1000, bool), xy, 0.4, (480, 640))
+    moving = in_moving_region((away < 60) | noise, np.ones(1000, bool), xy, 0.4, (480, 640))
     assert moving[away < 40].all()
     assert moving[(away > 120) & noise].mean() < 0.05
     np.testing.assert_array_equal(
-        failing_regions(noise, np.ones(1000, bool), xy, 0.0, (480, 640)), noise
+        in_moving_region(noise, np.ones(1000, bool), xy, 0.0, (480, 640)), noise
     )
 
 

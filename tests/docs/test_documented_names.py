@@ -62,7 +62,7 @@ POSE = re.compile(r"[TR]_[a-z]+_[a-z]+")
 
 @cache
 def mentions() -> list[Mention]:
-    """Of all pages and docstrings; read when a test asks, not by every process that collects."""
+    """Mentions of all pages and docstrings; read when a test asks, not by every process that collects."""
     return [*in_pages(), *in_docstrings()]
 
 

@@ -1,6 +1,7 @@
 """Pages are written in short sentences, say at their top what they are for, and stay short."""
 
 import ast
+import inspect
 import re
 import statistics
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 import results
 from helpers.documented_names import PAGES as WRITTEN
-from helpers.documented_names import ROOT, sources
+from helpers.documented_names import ROOT, read, sources
 
 LONGEST = 35
 MEDIAN = 18
@@ -160,6 +161,56 @@ def test_variables_are_named_by_what_they_hold() -> None:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in VARIABLES
     ]
     assert places == []
+
+
+# A docstring, and each entry of its sections, begins with the thing itself: a reader who looks up one
+# entry has not read those before it.
+
+
+REFERS_BACK = re.compile(
+    r"(?:Of|Likewise|Ditto|Same|Those|That of|The same|The others?|As (?:in|for)|As `)(?=\W)"
+)
+"""How texts begin that leave out their noun."""
+SECTION = re.compile(r"(?:Args|Attributes|Raises|Returns|Yields):")
+ENTRY = re.compile(r"[*\w.]+: (.*)")
+
+
+def refers_back(docstring: str) -> list[str]:
+    """The summary line and the entries of a docstring that begin without their noun."""
+    summary, *lines = inspect.cleandoc(docstring).splitlines()
+    texts = [summary]
+    is_in_section = False
+    for line in lines:
+        if line and not line.startswith(" "):
+            is_in_section = SECTION.fullmatch(line) is not None
+        # an entry is indented once, its further lines twice
+        elif is_in_section and line and not line.startswith(" " * 5):
+            entry = ENTRY.fullmatch(line.strip())
+            texts.append(line.strip() if entry is None else entry[1])
+    return [text for text in texts if REFERS_BACK.match(text)]
+
+
+@pytest.mark.parametrize(
+    ("docstring", "found"),
+    [
+        ("Of the window.", ["Of the window."]),
+        ("Radius.\n\nArgs:\n    radius: Of the window.\n", ["Of the window."]),
+        ("Radius.\n\nReturns:\n    The same in metres.\n", ["The same in metres."]),
+        ("Radius.\n\nOf two windows\nthe larger one.\n\nArgs:\n    radius: Office.\n", []),
+    ],
+)
+def test_a_text_without_its_noun_is_found(docstring: str, found: list[str]) -> None:
+    assert refers_back(docstring) == found
+
+
+@pytest.mark.slow
+def test_docstrings_begin_with_their_noun() -> None:
+    assert [
+        f"{file.relative_to(ROOT)}:{line}: {text}"
+        for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]
+        for line, docstring in read(file)[0]
+        for text in refers_back(docstring)
+    ] == []
 
 
 # Measured tables lie in `docs/results/`, each with its command, commit, date, machine and data.

@@ -208,7 +208,9 @@ def test_quitting_never_pays(reward: str) -> None:
     short, infos, ends = play(
         SlamEnv(ToySequence(20), TARGET, settings=lost, reward=reward, lost_after=3)
     )
+    # frames 1 to 3, then 3 lost ones
     assert len(short) == 6
+    # terminated, truncated
     assert ends[-1] == (True, False)
     assert sum(short) == pytest.approx(sum(whole), abs=1e-12)
     assert infos[-1]["episode_metrics"]["coverage"] == pytest.approx(4 / 20)
@@ -521,7 +523,7 @@ def rewards(name: str, truth: Trajectory, poses: np.ndarray, tracked: np.ndarray
 
 @pytest.mark.parametrize("seed", range(EPISODES))
 def test_losing_a_tracked_frame_raises_no_frames_reward(seed: int) -> None:
-    """Of every frame but the one that begins the frame of reference, alone, and from it on to the end."""
+    """Every frame but the one that begins the frame of reference is lost, alone, and from it on to the end."""
     truth, poses, tracked = episode(seed)
     earned = rewards("neg_pose_error", truth, poses, tracked)
     for frame in range(int(np.argmax(tracked)) + 1, len(poses), 5):

@@ -155,7 +155,7 @@ def test_what_fails_beside_tracking_on_the_last_frames_is_warned_of_when_the_env
     env = stepped(
         SlamEnv("synthetic/walking_xyz?scene=0&frames=3", "mask-rcnn", settings=settings), 0
     )
-    env._tracker._masks.segmenter = SimpleNamespace(segment=no_masks)
+    env._tracker._mask_scheduler.segmenter = SimpleNamespace(segment=no_masks)
     env.step(0)
     with pytest.warns(RuntimeWarning, match="no masks of frame 1"):
         env.close()
@@ -185,7 +185,8 @@ def test_a_state_with_a_cached_network_can_be_pickled_and_copies_share_the_netwo
     env = stepped(SlamEnv("synthetic/walking_xyz?scene=0&frames=3", "mask-rcnn", cache=True), 1)
     state = env.clone_state()
     copied, own = (
-        tracker._masks.segmenter.inner for tracker in (state.parts["_tracker"], env._tracker)
+        tracker._mask_scheduler.segmenter.inner
+        for tracker in (state.parts["_tracker"], env._tracker)
     )
     assert copied.network is own.network
     expected = rest(env)

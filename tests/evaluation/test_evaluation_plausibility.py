@@ -17,7 +17,7 @@ RIGHT = evaluate(ESTIMATE, TRUTH)
 
 
 def at(trajectory, stamps):
-    """The same poses at other stamps, seconds."""
+    """A trajectory's poses at other stamps, seconds."""
     return Trajectory(np.asarray(stamps, np.float64), trajectory.T_world_cam)
 
 

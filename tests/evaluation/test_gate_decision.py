@@ -81,10 +81,11 @@ def test_nothing_is_claimed_where_nothing_changed(spreads) -> None:
     assert wrong <= 16
 
 
-def test_ten_percent_are_found_in_most_gates() -> None:
+def test_a_regression_of_ten_percent_is_found_in_most_gates() -> None:
     rng = np.random.default_rng(2)
     results = []
     for _ in range(100):
+        # 2 sides, 16 sequences, 10 rounds; scatter 18 %
         runs = 0.18 * rng.normal(size=(2, 16, 10))
         results.append(verdict_at_looks(runs[0] - runs[1] + math.log(1.1)))
     verdicts = [verdict for verdict, _ in results]

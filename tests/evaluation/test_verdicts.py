@@ -15,10 +15,10 @@ from dynslam_bench.evaluation.verdicts import (
     PairedRatio,
     Verdict,
     detectable,
-    excluding_interval,
     family_test,
     findings,
     hodges_lehmann,
+    interval_with_ties,
     loses_more_p,
     may_be_best,
     paired_ratio,
@@ -84,7 +84,7 @@ def test_verdicts(ratios: list[float], verdict: Verdict) -> None:
 
 def test_without_ties_differences_are_excluded_by_the_signed_rank_interval() -> None:
     values = np.random.default_rng(11).normal(0.0, 0.2, 14)
-    assert excluding_interval(values, 0.90) == hodges_lehmann(values, 0.90)
+    assert interval_with_ties(values, 0.90) == hodges_lehmann(values, 0.90)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_without_ties_differences_are_excluded_by_the_signed_rank_interval() -> 
 def test_ties_exclude_by_the_other_scenes_or_by_their_number(
     ties: int, others: list[float], bounds: tuple[float, float]
 ) -> None:
-    _, low, high = excluding_interval([*[0.0] * ties, *others], 0.90)
+    _, low, high = interval_with_ties([*[0.0] * ties, *others], 0.90)
     assert (low, high) == pytest.approx(bounds)
 
 

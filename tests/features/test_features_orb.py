@@ -24,7 +24,7 @@ from dynslam_bench.features.matching import (
     rotation_consistent,
     search_in_radius,
 )
-from dynslam_bench.features.orb import EDGE, OrbExtractor, cell_side, spread
+from dynslam_bench.features.orb import EDGE, OrbExtractor, spread
 from dynslam_bench.features.registry import FEATURES, build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import inside
@@ -84,22 +84,6 @@ def test_weak_corners_count_only_in_cells_without_strong_ones():
         features.response[np.abs(features.xy - centre).max(axis=1) < 9] for centre in (105, 305)
     )
     assert strong.min() >= 30 > weak.max()  # neither is empty
-
-
-@pytest.mark.parametrize(("width", "side"), [(640, 30), (320, 15), (400, 19), (160, 8), (1242, 30)])
-def test_cells_shrink_with_narrow_images(width, side):
-    assert cell_side(FeatureSettings(), width) == side
-
-
-def test_a_small_image_keeps_its_weak_corners_beside_a_strong_one():
-    """Both squares lie in one cell of 40 pixels, and in two of 20, those of an image of this width."""
-    image = np.full((240, 320), 100, np.uint8)
-    image[100:110, 100:110] = 200  # strong square
-    image[124:134, 124:134] = 112  # weak square beside it
-    image = cv2.GaussianBlur(image, (3, 3), 0.8)
-    settings = FeatureSettings(levels=1, fast_threshold=30, fast_threshold_min=5, cell_px=40)
-    features = OrbExtractor(settings).extract(image)
-    assert (np.abs(features.xy - 129).max(axis=1) < 9).any()
 
 
 def test_orientation_turns_with_the_image():

@@ -27,7 +27,7 @@ from dynslam_bench.flow.sampling import (
 )
 
 LARGEST_BIN = 16_320
-"""Of a rectified derivative along an axis: sums over 2 x 2 pixels differ by 1,020 at most."""
+"""Largest value of a rectified derivative along an axis: sums over 2 x 2 pixels differ by 1,020 at most."""
 
 
 def numbers(rng, kind, shape, most=None):

@@ -106,7 +106,7 @@ def mutate_json(data: bytes, random: Random) -> bytes:
 
 
 def mutate_lines(data: bytes, random: Random) -> bytes:
-    """As `mutate_json` on one line of a file of JSON lines."""
+    """Apply `mutate_json` to one line of a file of JSON lines."""
     lines = data.split(b"\n")
     at = random.randrange(len(lines))
     lines[at] = mutate_json(lines[at], random)

@@ -36,7 +36,7 @@ def attack(target: Target, inputs: int, seed: int = 0) -> dict[str, bytes | None
     Args:
         target: The reader.
         inputs: Number of inputs.
-        seed: Of the damage.
+        seed: Seed of the damage.
 
     Returns:
         What escaped, with the input, one of a kind.

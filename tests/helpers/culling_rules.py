@@ -18,9 +18,9 @@ RULES = {
     kind.__name__: partial(
         kind,
         get_args(kind.__orig_bases__[0])[0](),
-        *FURTHER.get(kind, [SegmentationSettings()] * issubclass(kind, culling.ObjectRule)),
+        *FURTHER.get(kind, [SegmentationSettings()] * issubclass(kind, culling.ObjectFilter)),
     )
-    for kind in {*culling.Rule.__subclasses__(), *culling.ObjectRule.__subclasses__()}
-    - {culling.ObjectRule}
+    for kind in {*culling.BaseFilter.__subclasses__(), *culling.ObjectFilter.__subclasses__()}
+    - {culling.ObjectFilter}
 }
 """What makes each of them, by the name of its class."""

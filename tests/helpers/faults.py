@@ -139,7 +139,7 @@ class Survey:
     """What came of the faults.
 
     Attributes:
-        operations: Of the undisturbed work.
+        operations: Operations of the undisturbed work.
         ends: How often the disturbed work ended how, by fault and exit code.
     """
 

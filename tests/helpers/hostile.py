@@ -137,20 +137,13 @@ class Hostile:
 
 
 def alive(pids: list[int]) -> list[int]:
-    """Those that still run; a zombie does not."""
+    """The processes that still run; a zombie does not."""
     running = []
     for pid in pids:
         with contextlib.suppress(psutil.NoSuchProcess):
             if psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
                 running.append(pid)
     return running
-
-
-def until(condition, seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {seconds} s"
-        time.sleep(0.05)
 
 
 HOG = "import time; hoard = [b'x' * 2**24 for _ in range(100)]; time.sleep(300)"

@@ -15,7 +15,7 @@ CELLS = 16
 SIZE = 64
 MASKS = 4
 DETECTIONS = 20
-"""Of the YOLO networks below: side of the prototypes and of the image, prototypes, rows of detections."""
+"""Sizes of the YOLO networks below: side of the prototypes and of the image, prototypes, rows of detections."""
 BOX = (26, 9, 38, 39)
 """Corners of the only object of these networks; its mask fills the box: 360 px."""
 

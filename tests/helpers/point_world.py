@@ -8,7 +8,7 @@ import numpy as np
 from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import Camera, se3
-from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.backend import Backend, MonocularBackend
 from dynslam_bench.slam.observations import observe
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 
@@ -96,9 +96,7 @@ def observed(frame, camera, levels=8, keep=None):
 def make_backend(world, *, monocular=False, seed=0, **overrides):
     """A back end that is ready for a world; settings as ``group__name=value``."""
     kind, settings = (
-        (MonocularBackend, MonocularBackendSettings)
-        if monocular
-        else (RgbdBackend, BackendSettings)
+        (MonocularBackend, MonocularBackendSettings) if monocular else (Backend, BackendSettings)
     )
     backend = kind(
         apply_overrides(

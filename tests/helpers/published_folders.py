@@ -8,7 +8,7 @@ from dynslam_bench.geometry import se3
 NED = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 BASE_CAM = se3.exp(np.array([0.2, -0.1, 0.9, 0.3, -1.1, 0.7]))
 MATRIX = ", ".join(repr(value) for value in BASE_CAM.ravel().tolist())
-"""The same as files have it."""
+"""`BASE_CAM` as files have it: sixteen numbers, row by row."""
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 

@@ -66,7 +66,7 @@ class RingWorld(PointWorld):
         return poses
 
     def see(self, T_world_cam, index, **noise):
-        """As `PointWorld.see`, of the walls that no other wall hides."""
+        """What `PointWorld.see` sees of the walls that no other wall hides."""
         centre = T_world_cam[:3, 3]
         near = np.flatnonzero(np.linalg.norm(self.walls - centre, axis=1) < VIEW_M)
         sight = centre + (self.walls[near] - centre) * np.linspace(0.05, 0.95, 12)[:, None, None]

@@ -64,7 +64,7 @@ class SimulatedTuner(Study):
         spec: The study.
         results: Where its files lie.
         effect: True log ratio of settings to the best there is.
-        seed: Of the noise; the same run always comes out the same.
+        seed: Seed of the noise; the same run always comes out the same.
         in_memory: Keep the trials in memory, which is faster.
     """
 

@@ -43,7 +43,7 @@ class SmallScene:
     """Every third frame of a rendered sequence at half the resolution, in memory.
 
     Attributes:
-        id: Of the whole sequence.
+        id: Id of the whole sequence.
         frames: Numbered from 0.
         camera: At half the resolution.
     """

@@ -10,7 +10,7 @@ from helpers.reports_fake_store import add_frames, add_run, fill, page_data
 
 from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.view import sequence_part_of
 
 pytestmark = [needs_browser, pytest.mark.slow]
 NAME = "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} \N{HEBREW LETTER ALEF} $x_1$"
@@ -22,7 +22,7 @@ def report(tmp_path_factory):
     root = tmp_path_factory.mktemp("browser")
     store = fill(root / "results", seeds=(0, 1))
     place = write_folder(root / "toy", 40)
-    held = part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
+    held = sequence_part_of(open_frames(str(place), None, None, (0, None), 1), 0).content
     for name, label in (("ours", NAME), ("orb-slam2", "ORB-SLAM2 (our back end)")):
         settings = {"features.options": "one long word after the other " * 40, "features.levels": 8}
         run_id = add_run(
@@ -285,6 +285,7 @@ def test_picture_track_and_time_move_together(browser, report):
     state = """[one('#picture img').src.split('/').at(-1), +byId('frame').value,
         byId('time').layout.shapes.at(-1).x0, byId('track').data.at(-1).x[0]]"""
     at_first = browser.run(state)
+    assert at_first[1] == 39, "the page opens at the largest error"
     browser.run("(byId('frame').value = 3, byId('frame').oninput())")
     browser.settle()
     moved = browser.run(state)
@@ -304,12 +305,17 @@ def test_picture_track_and_time_move_together(browser, report):
     )
     browser.settle()
     assert browser.run("+byId('frame').value") == 15, "as by dragging the cursor"
+    browser.run("byId('play').click()")
+    browser.until("+byId('frame').value > 15")
+    browser.run("byId('play').click()")
+    assert browser.run("byId('play').textContent") == "Play"
     browser.run("one('#worst button').click()")
     assert browser.run("+byId('frame').value") == 39
     browser.run(
         "(byId('second').selectedIndex = 1, byId('second').onchange({target: byId('second')}))"
     )
-    browser.until("byId('track').data.length === 5")
+    # true path, track, residuals, the other track, corners and the place in time
+    browser.until("byId('track').data.length === 6")
     text = browser.run(
         "(all('details').forEach((fold) => { fold.open = true; }), one('main').innerText)"
     )
@@ -377,7 +383,7 @@ def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
     text = paths.markdown.read_text()
     runs = len(store.ids())
     assert len(pages) == 6 < runs
-    assert f"{runs - 6} of {runs} runs have no pictures" in text
+    assert f"{runs - 6} of {runs} runs have no track" in text
     assert "--most-pages 6" in (tmp_path / "report" / "reproduce.html").read_text()
     linked = {cell[6] for cell in page_data(tmp_path / "report", "board")["cells"]}
     # the typical run of every cell comes first
@@ -390,6 +396,19 @@ def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
     assert pageless in said
     assert "--most-pages" in said
     assert "walking_xyz" in title
+
+
+def test_paper_and_pages_without_scripts_show_tables_and_charts(browser, report):
+    open_page(browser, report, "index")
+    shown = "all('table.board')[0].querySelectorAll('thead th').length"
+    before = browser.run(shown)
+    browser.run("dispatchEvent(new Event('beforeprint'))")
+    assert browser.run(shown) > before, "columns on how sure it is are printed"
+    browser.run("dispatchEvent(new Event('afterprint'))")
+    assert browser.run(shown) == before
+    # every chart of this page has a picture
+    assert browser.run("all('.figure').every((figure) => figure.classList.contains('has-still'))")
+    assert browser.run("all('img.still').every((picture) => picture.naturalWidth > 100)")
 
 
 # -- two trackers, and two results folders

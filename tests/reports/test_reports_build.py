@@ -64,7 +64,8 @@ def test_every_page_loads_nothing_but_what_lies_beside_it(made):
             r"<(?:script|img|link|iframe|source)\b[^>]*\b(?:src|href)=\"?([^\">]+)", text
         )
         assert {"assets/plotly.min.js", "assets/page.css"} <= set(loaded)
-        assert all((folder / path).is_file() for path in loaded)
+        files = [path for path in loaded if not path.startswith("data:image/svg+xml;base64,")]
+        assert all((folder / path).is_file() for path in files)
         ids = re.findall(
             r'<[^<>]*\bid="([^"]+)"', re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
         )
@@ -552,10 +553,9 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     assert "the final trajectory has poses of 4 of" in thin.reason
     assert thin.ending.startswith("lost, 4/")
     assert not any(row.failed for row in load_runs([store], PROTOCOL).rows)
-    assert re.search(
-        r"\| thin \| \S+‡ \|",
-        build_report(store, tmp_path / "out", most_pages=0).markdown.read_text(),
-    )
+    build_report(store, tmp_path / "out", most_pages=0)
+    marked = r'title="it has poses of only 3 % of the tracked frames">[0-9.]+‡'
+    assert re.search(marked, (tmp_path / "out/errors.html").read_text())
 
 
 def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(
@@ -805,7 +805,7 @@ def test_latex_compiles_and_fits_a_column(odd):
 def test_captions_are_short_and_name_no_ids(odd):
     text = odd.latex.read_text()
     captions = re.findall(r"\\caption\{(.*)\}", text)
-    assert len(captions) > 8
+    assert 3 <= len(captions) <= 12, "a page of tables, not a book"
     for caption in captions:
         assert len(caption) < 140, caption
         assert "tum-rgbd/v1" in caption, caption

@@ -1,5 +1,6 @@
 """Who is ranked: systems that beat a static camera, real-time runs among themselves, monocular runs by scale."""
 
+import base64
 import json
 
 import numpy as np
@@ -57,7 +58,7 @@ def test_what_is_worse_than_a_static_camera_is_never_first():
     ]
     alone = make_board(rows)
     assert alone.ranked == []
-    assert names(alone, alone.no_better) == ["bad"]
+    assert names(alone, alone.ranked_out_by_static) == ["bad"]
     assert names(alone, alone.trackers) == ["still", "bad"]
     board = make_board([*rows, row("good", "s", 0.1), crashed("good", "t")])
     assert names(board, board.trackers) == ["good", "still", "bad"]
@@ -83,7 +84,7 @@ def test_worse_than_a_static_camera_is_a_geometric_mean(s, t, ranked):
     )
     key = next(key for key in board.labels if board.first(key).tracker.id == "one")
     assert board.static_ratio(key) == pytest.approx(np.sqrt(s * t) / 0.3)
-    assert (key in board.ranked) == ranked != (key in board.no_better)
+    assert (key in board.ranked) == ranked != (key in board.ranked_out_by_static)
 
 
 def fixed(tracker, error, **changes):
@@ -108,7 +109,7 @@ def test_before_a_fixed_camera_trackers_rank_though_none_is_better_than_not_movi
     systems = fixed("orb-slam2", 0.05), fixed("good", 0.002), fixed("bad", 0.24)
     board = make_board([*systems, fixed("never", 0.0, provenance="control")])
     assert names(board, board.ranked) == ["good", "orb-slam2", "bad"]
-    assert not board.no_better
+    assert not board.ranked_out_by_static
     assert board.groups == {"f": "fixed camera"}
     assert board.static_camera == {"f": 0.0}
     assert "no better" not in per_sequence(board, PROTOCOL).caption.replace("or are no better", "")
@@ -233,7 +234,7 @@ SIZES = {
 
 @pytest.fixture(scope="module")
 def boards():
-    """Of all sequences, and of each category."""
+    """The board of all sequences, and one of each category."""
     return category_boards(make_board(rows_of_truth(SIZES, {"high-dynamic": 12, "low-dynamic": 6})))
 
 
@@ -468,6 +469,26 @@ def test_sequences_of_a_fixed_camera_are_never_one():
     board = make_board(rows)
     assert board.common == ["s", "t"]
     assert not board.copies
+
+
+def test_a_fixed_camera_by_two_names_is_one_sequence_where_its_pictures_are_equal():
+    """The true path stands still and tells nothing; the pictures of frames do."""
+    still = {"duration_s": 2.5, "static_camera_ate_rmse_m": 0.0, "tags": ["fixed-camera"]}
+    rng = np.random.default_rng(3)
+    filmed = rng.integers(0, 240, (6, 192), dtype=np.uint8)
+    others = rng.integers(0, 240, (6, 192), dtype=np.uint8)
+    shown = {"man": filmed, "man_jpeg": filmed + np.uint8(2), "woman": others}
+    rows = []
+    for name, pictures in shown.items():
+        encoded = [base64.b64encode(picture).decode() for picture in pictures]
+        for tracker in ("orb-slam2", "b"):
+            run = row(tracker, name, 0.1, **still)
+            sequence = run.sequence.model_copy(update={"thumbnails": encoded})
+            rows.append(run.model_copy(update={"sequence": sequence}))
+    board = make_board(rows)
+    assert board.copies == {"man_jpeg": "man"}
+    assert board.common == ["man", "woman"]
+    assert "man counts once for man, man_jpeg" in copies_note(board)
 
 
 def test_exact_masks_are_a_bound_and_never_rank_beside_others():

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.core.reads import Anchors, ImportPath, digest_of
+from dynslam_bench.core.reads import BaseFolders, ImportPath, digest_of
 from dynslam_bench.runs.process.recorder import ReadRecorder
 
 
@@ -24,7 +24,9 @@ def record(job, answer):
     plugin = Path(job["plugin"])
     folder = plugin.parent if plugin.suffix == ".py" else None
     recorder = ReadRecorder(
-        Anchors(folder, Path(job["work"])), private=[Path(job["private"])], plugins=job["plugins"]
+        BaseFolders(folder, Path(job["work"])),
+        private=[Path(job["private"])],
+        plugins=job["plugins"],
     )
     recorder.start()
     module = load_object(f"{plugin}:run").__globals__

@@ -16,7 +16,8 @@ from pathlib import Path
 import psutil
 import pytest
 from helpers import hostile
-from helpers.hostile import alive, until
+from helpers.hostile import alive
+from helpers.waiting import until
 
 from dynslam_bench.core import SHARED_MEMORY, InfrastructureError
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one

@@ -29,7 +29,7 @@ import pandas as pd
 import pytest
 from helpers import envs_toys
 from helpers.envs_toys import TARGET, truth, write_folder
-from helpers.hostile import until
+from helpers.waiting import until
 
 from dynslam_bench.api import bench, report
 from dynslam_bench.cli.running import parse_shard, show_workers
@@ -341,7 +341,7 @@ def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> 
         RunStore(store.root).prepare()  # sweeps what nobody holds
         assert work.is_dir()
         (run_id,) = store.ids()  # the other one is being made elsewhere
-        assert run_id.startswith(resolve(specs[1]).asked)
+        assert run_id.startswith(resolve(specs[1]).request_digest)
     made = call.result(300)
     assert [record.status for record in made] == ["ok", "ok"]
     assert all(
@@ -390,7 +390,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
+def test_a_users_suite_makes_all_combinations_with_their_settings(tmp_path: Path) -> None:
     path = write(
         tmp_path / "mine.toml",
         """
@@ -409,6 +409,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
         """,
     )
     specs = list(load_suite(path).specs(data_root="/data", device="cpu", threads=2))
+    # 2 trackers x 2 seeds x 2 variants, the first unchanged
     assert len(specs) == 8
     assert {spec.threads for spec in specs} == {2}
     assert {spec.data_root for spec in specs} == {"/data"}

@@ -594,8 +594,10 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
         "another run moves the link"
     )
     assert (
-        found.asked
-        == found.model_copy(update={"overrides": {"backend.map.localisation_only": "true"}}).asked
+        found.requested_settings
+        == found.model_copy(
+            update={"overrides": {"backend.map.localisation_only": "true"}}
+        ).requested_settings
     )
 
     # another map at the same path is another run, and no repeat of the first

@@ -20,7 +20,7 @@ from dynslam_bench.core.module_graph import (
     read_module,
 )
 from dynslam_bench.runs import RunSpec, resolve
-from dynslam_bench.runs.own_code import BESIDE_THE_LOOP, FINDERS, modules_of_run
+from dynslam_bench.runs.own_code import REGISTRY_MODULES, RESULT_NEUTRAL_MODULES, modules_of_run
 
 pytestmark = pytest.mark.slow
 
@@ -190,7 +190,11 @@ def test_every_module_that_runs_is_one_that_counts(
     command = [sys.executable, "-c", TRACER, run.spec.model_dump_json(), str(tmp_path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     executed = set(json.loads(done.stdout.splitlines()[-1]))
-    beside = {PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in (*FINDERS, *BESIDE_THE_LOOP))}
+    beside = {
+        PACKAGE,
+        *PLUMBING,
+        *(f"{PACKAGE}.{name}" for name in (*REGISTRY_MODULES, *RESULT_NEUTRAL_MODULES)),
+    }
     # They only name what there is: the tables of trackers and of sequences, and the modules that
     # these read.
     finding = {f"{PACKAGE}.trackers.adapters.specs", f"{PACKAGE}.trackers.systems.emfoa_oft"}

@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from dynslam_bench.core.programs import ProgramReads, is_counted, look_at, program_environment
-from dynslam_bench.core.reads import Anchors, Reads, Verifier, digest_of, search_now
+from dynslam_bench.core.reads import BaseFolders, Reads, Verifier, digest_of, search_now
 
 pytestmark = pytest.mark.slow
 
@@ -88,8 +88,8 @@ class Bench:
         return self.root / "work"
 
     @property
-    def anchors(self) -> Anchors:
-        return Anchors(self.plugin.parent, self.work)
+    def base_folders(self) -> BaseFolders:
+        return BaseFolders(self.plugin.parent, self.work)
 
     def write(self, name: str, text: str) -> Path:
         file = self.root / name
@@ -121,7 +121,7 @@ class Bench:
 
     def changed(self, reads: Reads) -> str:
         verifier = Verifier([*self.path, *sys.path], {**os.environ, **self.environment})
-        return verifier.changed(reads, self.anchors)
+        return verifier.changed(reads, self.base_folders)
 
 
 @pytest.fixture
@@ -812,11 +812,11 @@ def test_search_paths_are_compared(bench: Bench) -> None:
 
 
 def test_what_opencv_adds_to_the_search_path_of_its_process_does_not_count(tmp_path: Path) -> None:
-    anchors = Anchors(None, tmp_path)
+    base_folders = BaseFolders(None, tmp_path)
     added = "/env/lib/python3.11/site-packages/cv2/../../lib64:"
-    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": added}, anchors) == ""
+    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": added}, base_folders) == ""
     assert (
-        search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, anchors)
+        search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, base_folders)
         == "work:/lib"
     )
     assert program_environment((), {"LD_LIBRARY_PATH": f"{added}/opt/lib"}) == {
@@ -1181,7 +1181,7 @@ def test_a_verifier_looks_at_each_thing_once(
     looked: list[str] = []
     real = module.content_now
     monkeypatch.setattr(module, "content_now", lambda path: looked.append(path) or real(path))
-    anchors = Anchors(None, tmp_path)
+    base_folders = BaseFolders(None, tmp_path)
     records = []
     for number in range(4):
         for name in ("shared", f"own{number}"):
@@ -1191,10 +1191,10 @@ def test_a_verifier_looks_at_each_thing_once(
         }
         records.append(Reads(files=digests))
     verifier = Verifier()
-    assert [verifier.changed(record, anchors) for record in records] == [""] * 4
+    assert [verifier.changed(record, base_folders) for record in records] == [""] * 4
     assert len(looked) == 5
     (tmp_path / "own2").write_text("another")
-    assert [Verifier().changed(record, anchors) for record in records] == [
+    assert [Verifier().changed(record, base_folders) for record in records] == [
         "",
         "",
         "the file own2",

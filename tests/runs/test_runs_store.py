@@ -132,9 +132,9 @@ def test_what_a_plug_in_that_a_setting_names_reads_is_recorded(
             settings={"segmentation.source": "embedded", name: value},
         )
         run = resolve(spec)
-        assert run.foreign, name
+        assert run.has_plugins_or_programs, name
         assert "plugin:/mine.py:build" in run.identity["parts"], name
-        assert run.anchors.plugin == plugin.parent
+        assert run.base_folders.plugin == plugin.parent
 
 
 def test_listing_finding_and_removing(store: RunStore) -> None:

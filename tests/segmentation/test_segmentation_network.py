@@ -235,7 +235,7 @@ def test_our_own_format_carries_the_shape(tmp_path):
 
 
 NARROW = {"stem": 8, "channels": 16, "box_hidden": 16, "mask_channels": 16}
-"""The same keys, fewer numbers."""
+"""Settings of a network with fewer channels, by the names of `NetworkConfig`."""
 
 
 def test_a_resnet18_checkpoint_is_recognised(tmp_path):

@@ -1001,7 +1001,7 @@ def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "end", ["masks are taken", "settle", "reset", "configure", "a copy's settle"]
+    "end", ["masks are taken", "wait_for_segmenter", "reset", "configure", "a copy's wait"]
 )
 def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken_else_warned_of(
     end,
@@ -1021,8 +1021,8 @@ def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are
         if end == "masks are taken"
         else pytest.warns(RuntimeWarning, match="frame 4")
     ):
-        ends.get(end, stage.settle)()
-    stage.settle()
+        ends.get(end, stage.wait_for_segmenter)()
+    stage.wait_for_segmenter()
 
 
 def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():

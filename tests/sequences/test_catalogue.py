@@ -273,7 +273,7 @@ def test_connections_that_break_are_resumed(get, server, packed, plan, ranges, r
 
 @pytest.mark.parametrize("changed", [False, True])
 def test_the_next_call_goes_on_where_this_one_stopped(get, server, packed, tmp_path, changed):
-    """Of a file that changed on the server it begins from the start."""
+    """A file that changed on the server is fetched from its beginning."""
     server.plan = [{"cut": 50_000}, *[{"cut": 0}] * 3]
     with pytest.raises(
         DownloadError,

@@ -10,7 +10,7 @@ from helpers.sequence_folders import SHARED, Altered, needs_shared
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, in_camera_axes, nearest_rotation
 from dynslam_bench.sequences import SequenceView, open_sequence
-from dynslam_bench.sequences.calibration import Estimate, Window, _readout_quantity
+from dynslam_bench.sequences.calibration import CalibrationEstimate, Window, _readout_quantity
 from dynslam_bench.sequences.depth_scale import DepthScale, depth_scale
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, examine, truth_findings
 from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
@@ -26,14 +26,14 @@ class Recording:
     """Pairs of frames of a hand-held camera in a cloud of points, and their truth.
 
     Args:
-        seed: Of the path, the points and the noise.
+        seed: Seed of the path, the points and the noise.
         frames: Frames at 30 Hz.
         speed: Metres a second, about.
         scale: By which the depth is too large.
-        readout_s: Of the rolling shutter.
+        readout_s: Readout time of the rolling shutter, seconds.
         people: Part of the points that walk.
         turning: Standard deviation of the people's turn from image to image, rad.
-        lever_m: Of the camera from the body whose poses the truth holds.
+        lever_m: Position of the camera on the body whose poses the truth holds, metres.
         late_s: By which the truth is late.
         noise_px: Standard deviation of the corners.
         followed: Whether the measured motions are those relative to the people: most corners lie on
@@ -254,7 +254,7 @@ def test_the_truth_of_published_markers_is_no_fault_and_hides_none(seed):
     "turn", [np.array([0, 0, np.pi / 2]), np.array([2.0, 0, 0]), np.array([0.5, -1, 1])]
 )
 def test_other_axes_are_a_fault(turn):
-    """Those that nobody publishes; the recordings' rotations tell them."""
+    """Axes that nobody publishes; the recordings' rotations tell them."""
     recording = Recording(1)
     poses = recording.truth.T_world_cam @ se3.exp(np.concatenate([np.zeros(3), turn]))
     recording.truth = recording.truth.with_poses(poses)
@@ -367,7 +367,7 @@ def windows_at(fps):
 )
 def test_no_readout_is_longer_than_the_time_between_frames(fps, stated_s, value_s, half_s, written):
     camera = replace(CAMERA, readout_s=stated_s)
-    found = _readout_quantity(Estimate(value_s, half_s), windows_at(fps), camera)
+    found = _readout_quantity(CalibrationEstimate(value_s, half_s), windows_at(fps), camera)
     assert found.written == written
     assert found.reason
     kept = camera.readout_s if found.written is None else found.written

@@ -7,6 +7,7 @@ from helpers.sequence_folders import make_folder, rewrite
 
 from dynslam_bench.core import SequenceError
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.cameras import CameraError
 
 CAMERA = (
     "width = 32\nheight = 24\nfx = 30.0\nfy = 30.5\ncx = 15.5\ncy = 11.5\ndepth_factor = 5000.0\n"
@@ -210,7 +211,7 @@ def test_files_that_are_no_images_are_counted(tmp_path):
     assert "1 files that are no images" in open_sequence(folder).dropped
 
 
-@pytest.mark.parametrize("stem", ["frame_0000", "left-12", "0000a"])
+@pytest.mark.parametrize("stem", ["frame_1_", "left-1-2", "0000a"])
 def test_names_that_are_no_numbers_say_what_to_write_and_it_works(tmp_path, stem):
     folder = named(tmp_path / "rec", [f"{stem}{i}" for i in range(3)])
     for kind in ("rgb", "depth"):
@@ -221,3 +222,59 @@ def test_names_that_are_no_numbers_say_what_to_write_and_it_works(tmp_path, stem
             "".join(f"{i / 30:.9f} {kind}/{stem}{i}.png\n" for i in range(3))
         )
     assert len(open_sequence(folder)) == 3
+
+
+@pytest.mark.parametrize(
+    ("colour", "names", "suffix"),
+    [
+        ("color", ["frame_0001", "frame_0002", "frame_0003"], ".jpg"),
+        ("colour", ["000001", "000002", "000003"], ".jpeg"),
+        ("image", ["1.color", "2.color", "3.color"], ".png"),
+        ("images", ["img1", "img2", "img3"], ".png"),
+    ],
+)
+def test_folders_and_names_of_other_tools_are_read(tmp_path, colour, names, suffix):
+    folder = named(tmp_path / "rec", names, 30.0)
+    for path in sorted((folder / "rgb").iterdir()):
+        cv2.imwrite(str(path.with_name(path.stem + suffix)), cv2.imread(str(path)))
+        if suffix != ".png":
+            path.unlink()
+    (folder / "rgb").rename(folder / colour)
+    sequence = open_sequence(folder)
+    np.testing.assert_allclose(sequence.timestamps, [1 / 30, 2 / 30, 3 / 30], atol=1e-8)
+    assert (
+        f"colour in {colour}, depth in depth, 3 frames at 30 Hz (stated)" in sequence.taken_for[0]
+    )
+    assert "5000 raw depth units a metre" in sequence.taken_for[1]
+    assert sequence.taken_for[2] == "no ground truth"
+
+
+def test_of_two_folders_of_colour_the_one_that_is_not_taken_is_named(tmp_path):
+    folder = named(tmp_path / "rec", ["1", "2"], 30.0)
+    (folder / "image").mkdir()
+    assert "image/ is not used: rgb/ is taken" in open_sequence(folder).taken_for[2]
+
+
+@pytest.mark.parametrize("names", [["a1", "b2"], ["1-2", "2-3"], ["first", "second"]])
+def test_names_that_differ_in_more_than_a_number_are_refused(tmp_path, names):
+    with pytest.raises(SequenceError, match="is not a timestamp in seconds"):
+        open_sequence(named(tmp_path / "rec", names, 30.0))
+
+
+def test_one_camera_file_asks_for_all_that_is_missing(tmp_path):
+    folder = named(tmp_path / "rec", ["1", "2", "3"])
+    (folder / "camera.toml").unlink()
+    with pytest.raises(CameraError) as caught:
+        open_sequence(folder)
+    template = caught.value.template
+    assert "width = 32" in template
+    filled = (
+        template.replace("fx = ", "fx = 30 ")
+        .replace("fy =", "fy = 30")
+        .replace("cx = ", "cx = 16 ")
+    )
+    filled = filled.replace("cy =", "cy = 12").replace("fps = ", "fps = 30 ")
+    (folder / "camera.toml").write_text(
+        filled.replace("# depth_factor = 5000", "depth_factor = 5000")
+    )
+    assert open_sequence(folder).fps == 30.0

@@ -701,8 +701,11 @@ def test_frames_are_the_same_and_decoded_once(
     reads = Mock(wraps=recorded.read_colour)
     mapped = Decoded(plain)
     monkeypatch.setattr(recorded, "read_colour", reads)
-    assert same(mapped, Decoded(open_sequence(folder))), "opening decodes the first frame"
-    assert reads.call_count == 1, "opening decodes the first frame"
+    assert reads.call_count == 0, "making it decodes nothing"
+    assert same(mapped, Decoded(open_sequence(folder)))
+    decoded_once = reads.call_count
+    assert same(mapped, Decoded(open_sequence(folder)))
+    assert reads.call_count - decoded_once == 1, "opening decodes the first frame"
     assert same(mapped, plain)
     assert mapped[-1].index == 5
     assert (mapped.id, mapped.digest(), mapped.camera) == (plain.id, plain.digest(), plain.camera)
@@ -718,7 +721,7 @@ def test_frames_are_the_same_and_decoded_once(
     "damage", [lambda data: data[:-9], lambda _: b"", lambda data: b"x" * len(data)]
 )
 def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage) -> None:
-    Decoded(open_sequence(folder))
+    Decoded(open_sequence(folder))[0]
     (file,) = files(cache)
     file.write_bytes(damage(file.read_bytes()))
     assert same(Decoded(open_sequence(folder)), open_sequence(folder))
@@ -745,7 +748,8 @@ def test_of_several_at_once_one_decodes(
     written = Mock(wraps=decoded._write)
     monkeypatch.setattr(decoded, "_write", written)
     with ThreadPoolExecutor(3) as pool:
-        assert {len(made) for made in pool.map(decoded.Decoded, [open_sequence(folder)] * 3)} == {6}
+        frames = pool.map(lambda sequence: Decoded(sequence)[1], [open_sequence(folder)] * 3)
+        assert {frame.index for frame in frames} == {1}
     assert written.call_count == 1
     assert len(files(cache)) == 1
 
@@ -759,12 +763,12 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(folder: Path, cache: StageCa
         with pytest.raises(
             DynslamError, match=r"cannot write the 0 MB of decoded frames .*free some space"
         ) as caught:
-            Decoded(sequence)
+            Decoded(sequence)[0]
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "\n" not in str(caught.value)
     assert files(cache) == []
-    assert len(Decoded(sequence)) == 6
+    assert Decoded(sequence)[5].index == 5
 
 
 def test_more_frames_than_the_cache_holds_are_refused(
@@ -781,7 +785,7 @@ def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
     sequence = open_sequence(folder)
     (folder / "depth" / "3.png").write_bytes(b"damaged")
     with pytest.raises(SequenceError, match=r"3\.png"):
-        Decoded(sequence)
+        Decoded(sequence)[0]
     assert files(cache) == []
 
 

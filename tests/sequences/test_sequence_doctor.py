@@ -42,7 +42,7 @@ from dynslam_bench.sequences.preprocessing import Preprocessed, normalise
 from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.synthetic.settings import ColorSensor
-from dynslam_bench.sequences.view import Part, Wrapped, part_of
+from dynslam_bench.sequences.view import SequencePart, Wrapped, sequence_part_of
 
 FRAMES = 80
 
@@ -398,7 +398,7 @@ class Room:
 
 
 class Watched(Wrapped):
-    """The same; `most` counts the largest number of its images that existed at once."""
+    """A wrapped sequence whose `most` is the largest number of its images that existed at once."""
 
     def __init__(self, base):
         self.base = base
@@ -678,8 +678,8 @@ def test_equalisation_spreads_a_dark_image_and_keeps_the_hue():
 WALK = "synthetic/walking_xyz"
 
 
-def part(name: object, offset: int = 0, **how: object) -> Part:
-    return part_of(open_sequence(str(name), **how), offset)
+def part(name: object, offset: int = 0, **how: object) -> SequencePart:
+    return sequence_part_of(open_sequence(str(name), **how), offset)
 
 
 def test_all_spellings_of_the_same_frames_are_one_part() -> None:

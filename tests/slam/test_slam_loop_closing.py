@@ -374,7 +374,7 @@ def test_maps_that_never_meet_stay_apart_and_filters_see_the_active_one():
     assert all(view.timestamp > 2.4 for view in views), "keyframes of the root map are older"
     assert set(ids.tolist()) == set(slam_map.id[slam_map.points_of(slam_map.submap(1))].tolist())
     assert 0 < len(ids) < len(slam_map.points)
-    assert backend.predict(8.0)[0] is not None
+    assert backend.predict_T_world_cam(8.0)[0] is not None
     without, results, _ = drive(RingWorld(), APART, STEP)
     assert set(states(results)[25:]) == {"lost"}
     assert {record.map for record in without.outputs().keyframes} == {0}

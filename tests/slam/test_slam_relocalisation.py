@@ -17,7 +17,7 @@ from dynslam_bench.slam.relocalisation import (
     STRIDE,
     RelocalisationGate,
     RotationEstimate,
-    contradict,
+    are_different_places,
     is_aliased,
     match_keyframe,
     pose_uncertainty,
@@ -89,12 +89,15 @@ def test_perceptual_aliasing(alike, aliased):
     backend, tracking, _ = run(world, [*range(2 * QUARTER)])
     lap = world.lap(2 * QUARTER, STEP)
     observations = observed(world.see(lap[10], 999), world.camera)
-    here = InitialPose(se3.inverse(lap[10]) @ lap[0], None, 0, share=1.0, depth=3.0)
+    here = InitialPose(se3.inverse(lap[10]) @ lap[0], None, 0, seen_share=1.0, depth=3.0)
     everywhere = backend.map.keyframes
     assert (tracking == "ok").all()
     assert is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0) is aliased
     assert not is_aliased(backend.map, observations, {0: here}, everywhere[:4], settings, 0)
-    near = lambda submap, pose: not contradict(here, InitialPose(pose, None, 0, depth=3.0))  # noqa: E731
+
+    def near(submap, pose):
+        return not are_different_places(here, InitialPose(pose, None, 0, depth=3.0))
+
     assert not is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0, near)
 
 
@@ -109,7 +112,7 @@ def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_fr
     backend, recognised, _ = run(RingWorld(), [*range(15), *range(60, 70)])
     assert (recognised[15:] == "lost").all(), "the first of the ten is compared by tracking"
     assert len(calls) == 9, "the first of the ten is compared by tracking"
-    assert backend.predict(2.6) == (None, None)
+    assert backend.predict_T_world_cam(2.6) == (None, None)
 
 
 # ---------------------------------------------------------------------- the gate
@@ -204,7 +207,7 @@ def test_a_pose_grows_from_a_patch():
     place = verified(
         backend, observations, lambda xy: np.abs(xy - 120).max(axis=1) < 70, se3.inverse(pose)
     )
-    assert place.share > 0.7
+    assert place.seen_share > 0.7
     assert len(place.matches) > 150
     assert np.linalg.norm(se3.inverse(place.T_cam_world)[:3, 3] - pose[:3, 3]) < 0.03
 
@@ -220,7 +223,7 @@ def test_what_people_hide_is_not_expected_to_be_seen():
     behind = verified(
         backend, observed(replace(frame, mask=mask), room.camera, keep=outside), patch, FIRST
     )
-    assert without.share < 0.4 < 0.8 < behind.share
+    assert without.seen_share < 0.4 < 0.8 < behind.seen_share
     assert len(behind.matches) == len(without.matches)
 
 
@@ -391,7 +394,7 @@ def test_of_equal_scores_the_newer_keyframe_is_first(room, slam_map):
 
 
 def reference_scores(slam_map, keyframes, features):
-    """The same score, counted substring by substring without an index."""
+    """Scores of keyframes, counted substring by substring without an index."""
     query = np.ascontiguousarray(features.descriptors).view(np.uint16)[:, ::STRIDE]
     shared = []
     for slot in keyframes.tolist():

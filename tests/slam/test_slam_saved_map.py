@@ -13,7 +13,7 @@ from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.slam.atlas import packed
-from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.backend import Backend
 from dynslam_bench.slam.map_files import (
     HEADER,
     MAP_SCHEMA,
@@ -72,7 +72,7 @@ def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
 def test_localisation_only_relocalises_and_leaves_the_map_unchanged(made, tmp_path):
     room, poses, file, _ = made
     backend = make_backend(room, map__file=str(file), map__localisation_only=True)
-    assert backend.predict(0.0) == (None, None)
+    assert backend.predict_T_world_cam(0.0) == (None, None)
     elsewhere = [PointWorld(seed=9).see(pose, i) for i, pose in enumerate(poses[:8])]
     # from the end of the path, which the map does not know
     order = [*range(2 * HALF - 1, HALF // 2, -1)]
@@ -126,7 +126,7 @@ def test_a_map_of_another_sensor_or_other_features_is_refused(made, change, feat
     room, _, file, _ = made
     camera = room.camera.resized(*change["size"]) if "size" in change else room.camera
     settings = StartMapSettings(file=str(file.parent / change.get("file", file.name)))
-    backend = RgbdBackend(BackendSettings(map=settings), **features)
+    backend = Backend(BackendSettings(map=settings), **features)
     backend.uses_depth = not change.get("monocular", False)
     with pytest.raises(SettingsError, match=words):
         backend.reset(camera, 0)
@@ -150,7 +150,7 @@ def test_other_descriptors_and_missing_maps_are_refused(made, tmp_path):
 
 @pytest.fixture
 def arrays(made):
-    """Those of the map's file."""
+    """Arrays of the map's file."""
     with np.load(made[2]) as stored:
         return dict(stored)
 

@@ -21,7 +21,7 @@ from dynslam_bench.core import DynslamError, StudyError, read_settings
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.evaluation.verdicts import LOOKS, ONE_SIDED, USUAL_SPREAD, power
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.sequences.view import part_of
+from dynslam_bench.sequences.view import sequence_part_of
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
     Plan,
@@ -73,12 +73,14 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert before.runs == 0
     assert before.spread == pytest.approx(USUAL_SPREAD)
     assert before.scenes == 3
+    assert "50 ms a frame" in before.figures[-1], "an assumption is stated as one"
     assert not (tmp_path / "studies").exists(), "looking makes no study"
     run_study(make(folders), results=tmp_path)
     after = Plan(make(folders), tmp_path).preview(jobs=2)
     assert after.runs == 3
     assert after.spread >= before.spread
     assert after.minutes != before.minutes
+    assert "ms a frame" not in after.figures[-1]
     assert after.unused == {}
     assert "3 scenes judge this study; below 6 it claims nothing" in after.figures[0]
     assert after.power == 0.0
@@ -562,9 +564,10 @@ def disguised(whole: Path, copy: Path, how: str) -> Path:
 def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
     copy = disguised(whole, tmp_path / "copy", how)
-    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, (
-        "digests alone pass it"
-    )
+    assert (
+        sequence_part_of(open_sequence(str(copy))).scene
+        != sequence_part_of(open_sequence(str(whole))).scene
+    ), "digests alone pass it"
     for pair in ((whole, copy), (copy, whole)):
         with pytest.raises(StudyError, match="are the same sequence"):
             check(*([str(folder)] for folder in pair))

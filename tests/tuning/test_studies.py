@@ -25,7 +25,6 @@ import optuna
 import pytest
 from helpers import toy_tracker
 from helpers.faults import in_a_small_process, survey
-from helpers.hostile import until
 from helpers.simulated import (
     HELD_OUT,
     TRACKER,
@@ -37,6 +36,7 @@ from helpers.simulated import (
     toy_spec,
     valley,
 )
+from helpers.waiting import until
 from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import OperationalError

@@ -32,7 +32,7 @@ from dynslam_bench.tuning import (
     run_study,
     write_page,
 )
-from dynslam_bench.tuning.judgement import Candidate, StudySummary, conclude, judge
+from dynslam_bench.tuning.judgement import Candidate, StudySummary, conclude, judge, next_step
 from dynslam_bench.tuning.objectives import (
     OBJECTIVES,
     Configuration,
@@ -43,6 +43,7 @@ from dynslam_bench.tuning.objectives import (
     compare,
     improvement_bound,
     own_objective,
+    scene_errors_m,
 )
 from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
 from dynslam_bench.tuning.plan import Design, with_more_starts
@@ -62,6 +63,7 @@ GAIN = on_scenes(0.7, 0.72, 0.75, 0.77, 0.8, 0.74)
 NOTHING = on_scenes(1.01, 0.99, 1.005, 1.02, 0.98, 0.995)
 OPEN = on_scenes(0.4, 1.9, 0.7, 1.5, 0.9, 1.2)
 PERHAPS = on_scenes(0.5, 0.6, 0.9, 0.7, 1.3, 0.8, 0.9)
+UNSETTLED = on_scenes(*[0.6, 1.05, 0.7] * 4).model_copy(update={"high": 1.02})
 LOSS = on_scenes(1.3, 1.4, 1.5, 1.6, 1.2, 1.3)
 
 
@@ -197,10 +199,9 @@ def test_settings_without_any_effect_are_named() -> None:
 
 def test_an_extendable_study_names_the_command_of_its_next_look() -> None:
     spec = make_spec(tune=["synthetic/walking_xyz?scene=0-3&frames=20"], extendable=True)
-    unsettled = on_scenes(*[0.6, 1.05, 0.7] * 4).model_copy(update={"high": 1.02})
-    _, text = conclude(spec, [candidate(held_out=unsettled)])
+    _, text = conclude(spec, [candidate(held_out=UNSETTLED)])
     assert "dynslam-bench tune extend STUDY.toml --scenes 12" in text
-    _, text = conclude(SPEC, [candidate(held_out=unsettled)])
+    _, text = conclude(SPEC, [candidate(held_out=UNSETTLED)])
     assert "a new study" in text
     assert "extend STUDY" not in text
 
@@ -516,6 +517,89 @@ def test_the_table_holds_default_chosen_and_range() -> None:
     assert "keep the baseline" in unproven.caption
 
 
+def test_errors_by_scene_divide_to_the_ratios_that_judge() -> None:
+    instances = [
+        ProblemInstance(f"synthetic/walking_xyz?scene={scene}", offset=offset)
+        for scene in range(6)
+        for offset in range(3)
+    ]
+    rng = np.random.default_rng(3)
+    baseline = outcomes(
+        {
+            each: float(error)
+            for each, error in zip(instances, rng.uniform(0.01, 0.1, 18), strict=True)
+        }
+    )
+    tried = outcomes(
+        {
+            each: float(error)
+            for each, error in zip(instances, rng.uniform(0.01, 0.1, 18), strict=True)
+        }
+    )
+    ratios = by_scene(
+        {each: run.ate_m for each, run in tried.items()},
+        {each: run.ate_m for each, run in baseline.items()},
+    )
+    tried_m = scene_errors_m(tried)
+    baseline_m = scene_errors_m(baseline)
+    for scene, ratio in ratios.items():
+        assert math.log(tried_m[scene] / baseline_m[scene]) == pytest.approx(ratio)
+
+
+def test_a_finished_study_keeps_the_errors_of_each_judging_scene(tmp_path: Path) -> None:
+    tuner = SimulatedTuner(make_spec(trials=6), tmp_path).run()
+    best = finish(tuner).best
+    assert best is not None
+    assert best.evidence is not None
+    assert len(best.scene_errors) == best.evidence.all_scenes
+    assert all(scene.baseline_m > 0 and scene.candidate_m > 0 for scene in best.scene_errors)
+    # `summary.json` keeps them
+    stored = StudySummary.read(tuner.folder / "summary.json").best
+    assert stored is not None
+    assert stored.scene_errors == best.scene_errors
+
+
+@pytest.mark.parametrize(
+    ("verdict", "evidence", "extendable", "wanted"),
+    [
+        (Verdict.PROVEN, on_scenes(*[0.5] * 12), False, "--settings best.toml"),
+        (Verdict.WORSE, on_scenes(*[2.0] * 12), False, "run toy SEQUENCE"),
+        (Verdict.NO_DIFFERENCE, on_scenes(*[1.0] * 12), False, "run toy SEQUENCE"),
+        (Verdict.PROMISING, UNSETTLED, True, "--scenes 12"),
+        (
+            Verdict.CANNOT_TELL,
+            on_scenes(0.8, 0.9, 0.7, 1.2, 0.9, 1.1, 0.8, 0.95),
+            False,
+            "tune run",
+        ),
+        (
+            Verdict.BUT_LOST,
+            on_scenes(*[0.5] * 12, lost=[3]),
+            False,
+            "'scene 3' --settings best.toml --snapshots",
+        ),
+    ],
+)
+def test_every_verdict_has_a_command_to_go_on_with(
+    verdict: Verdict, evidence: PairedRatio, extendable: bool, wanted: str
+) -> None:
+    spec = make_spec(extendable=extendable)
+    summary = StudySummary(
+        name="study",
+        tracker="toy",
+        baseline="default settings",
+        protocol="",
+        trials={},
+        candidates=[candidate(held_out=evidence)],
+        verdict=verdict,
+        conclusion="",
+        held_out=["scene 0"],
+    )
+    configuration = Configuration("toy", {})
+    _, command = next_step(spec, summary, configuration, configuration)
+    assert wanted in command
+
+
 @pytest.mark.slow
 @needs_browser
 def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
@@ -533,7 +617,8 @@ def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None
         assert browser.violations() == []
         assert browser.run("one('.verdict').textContent") == summary.conclusion
         stages = browser.run("byId('result-1').layout.xaxis.ticktext")
-        complete = len(tuner.study.get_trials(states=(TrialState.COMPLETE,)))
+        # trial 0 has the baseline's settings
+        complete = len(tuner.study.get_trials(states=(TrialState.COMPLETE,))) - 1
         assert stages == [
             f"tried: {complete} whole trials",
             "held out: 1",

@@ -26,7 +26,7 @@ from dynslam_bench.geometry import (
     se3,
 )
 from dynslam_bench.sequences.bags import read_bag_poses
-from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list
+from dynslam_bench.sequences.readers.files import POSE, camera_poses_from_body, read_image_list
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.slam.map_files import Cloud
 
@@ -41,11 +41,12 @@ def read_trajectory(
             VSLAM-LAB's, a folder of COLMAP's text files (or its ``images.txt``), or a bag.
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one
             each, for COLMAP a list of stamps and images such as ``rgb.txt``.
-        topic: Of a bag with several topics of poses, the one to take.
+        topic: The topic to take of a bag that has several topics of poses.
 
     Raises:
         DynslamError: A file cannot be read, is malformed, or stamps are missing.
     """
+    # a reconstruction of COLMAP, a bag, or a file with a pose a line
     path = Path(path).expanduser()
     if path.name == IMAGES or (path / IMAGES).is_file():
         trajectory = read_colmap(
@@ -88,6 +89,7 @@ def write_pose_table(folder: Path, form: str, trajectory: Trajectory) -> None:
     Raises:
         DynslamError: The file cannot be written.
     """
+    # position and quaternion (x, y, z, w), in the order of the table's columns
     name, heading, columns = POSE_TABLES[form]
     rows = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1)[:, columns].tolist()
     lines = [
@@ -111,9 +113,9 @@ def write_colmap(
     """Write a reconstruction.
 
     Args:
-        folder: Where; it exists.
+        folder: Folder of the reconstruction; it exists.
         trajectory: Camera-to-world poses, one an image.
-        camera: Of all images.
+        camera: The camera of all images.
         names: The image of each pose, relative to the folder of images.
         cloud: Map points, written without tracks and with the error 0, neither of which is known;
             None for none.
@@ -121,7 +123,7 @@ def write_colmap(
     Raises:
         DynslamError: A file cannot be written.
     """
-    # the camera
+    # one camera for all images
     model, parameters = _colmap_camera(camera)
     numbers = " ".join(f"{value:.12g}" for value in parameters)
     write_atomic(
@@ -138,7 +140,7 @@ def write_colmap(
         lines += [f"{number} {pose} 1 {name}", ""]
     write_atomic(folder / IMAGES, "\n".join(lines) + "\n")
 
-    # the map points
+    # the map points, without tracks and with the error 0
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     if cloud is not None:
         rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)
@@ -177,9 +179,12 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
     numbered = enumerate(read_lines(path, kind=TrajectoryError), start=1)
     lines = ((number, line) for number, line in numbered if not line.startswith("#"))
     for number, line in lines:
+        # an image has two lines, of which the second holds its points and is often empty
         if not line.strip():
             continue
-        next(lines, None)  # the line of the image's points, often empty
+        next(lines, None)
+
+        # ID QW QX QY QZ TX TY TZ CAMERA NAME; the name may hold spaces
         parts = line.split(maxsplit=9)
         if len(parts) != 10 or not all(map(is_number, parts[1:8])):
             raise TrajectoryError(
@@ -196,6 +201,8 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         poses_by_stamp[stamp] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
     if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
+
+    # in order of time, camera to world
     stamps_in_order = sorted(poses_by_stamp)
     poses = np.array([poses_by_stamp[stamp] for stamp in stamps_in_order])
     return Trajectory(np.array(stamps_in_order), se3.inverse(poses))
@@ -235,7 +242,7 @@ PATH_MESSAGE = "nav_msgs/msg/Path"
 
 
 def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
-    """The poses of a ROS 1 or 2 bag or an MCAP file, taken for the camera's.
+    """The poses of a ROS 1 or 2 bag or an MCAP file, which are assumed to be the camera's own.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
@@ -246,7 +253,9 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
             was not named.
     """
     stamps, rows = read_bag_poses(path, topic)
-    camera_poses = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    camera_poses = (
+        camera_poses_from_body(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
+    )
     if camera_poses is None:
         raise TrajectoryError(f"{path} holds no pose", "name its topic with --topic")
     return camera_poses
@@ -256,8 +265,8 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     """Write trajectories, each on the topics ``/NAME/pose`` and ``/NAME/path``.
 
     Args:
-        folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its
-            ``metadata.yaml``.
+        folder: Folder that becomes a bag of ROS 2: ``trajectory.mcap`` with its ``metadata.yaml``.
+            It exists.
         trajectories: Camera-to-world poses by name.
 
     Raises:
@@ -286,11 +295,12 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) 
     """Write a trajectory: each pose at its stamp, and all of them as a path at the first one.
 
     Args:
-        writer: Of the bag.
+        writer: Writer of the bag, from ``rosbags``.
         store: The types of the messages.
-        name: Of the trajectory.
+        name: Name of the trajectory, the first part of its topics.
         trajectory: Camera-to-world poses.
     """
+    # a message for each pose: position and quaternion (x, y, z, w) in the frame ``world``
     types = store.types
     poses = []
     topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
@@ -305,6 +315,8 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) 
         message = types[POSE_MESSAGE](header=header, pose=pose)
         poses.append(message)
         writer.write(topic, ns, store.serialize_cdr(message, POSE_MESSAGE))
+
+    # the whole path in one message, for viewers
     if poses:
         whole = types[PATH_MESSAGE](header=poses[0].header, poses=poses)
         topic = writer.add_connection(f"/{name}/path", PATH_MESSAGE, typestore=store)

@@ -46,7 +46,7 @@ class RecordedFrame:
     """A frame of a recording.
 
     Attributes:
-        index: Of the frame in the run's part of the sequence.
+        index: Index of the frame in the run's part of the sequence.
         stamp: Seconds.
         jpeg: The image at half size, see `encode`.
         pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it
@@ -97,7 +97,7 @@ def write_recording(
 
     Args:
         path: The file.
-        camera: Of the images.
+        camera: Intrinsics of the images at full size.
         name: Recording's name in the viewer.
         frames: In order.
         tracks: The estimate, and the truth in its frame.
@@ -109,6 +109,7 @@ def write_recording(
     check_rerun()
     import rerun as rr
 
+    # `touch` fails at once where the file cannot be written
     stream = rr.RecordingStream("dynslam-bench")
     with translate_errors(
         RunError,
@@ -118,6 +119,8 @@ def write_recording(
     ):
         path.touch()
         stream.save(str(path), default_blueprint=_blueprint())
+
+    # the frames in order of time, then what has no time
     stream.send_recording_name(name)
     _log_frames(rr, stream, camera, frames)
     _log_scene(rr, stream, tracks, cloud)
@@ -142,12 +145,12 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
     """Log the frames in order.
 
     Args:
-        rr: The library.
-        stream: The recording.
-        camera: Of the images at full size.
+        rr: The module ``rerun``.
+        stream: rerun's ``RecordingStream``.
+        camera: Intrinsics of the images at full size.
         frames: The frames.
     """
-    # width and height of the images in the recording, and what they are of those at full size
+    # width and height of the images in the recording, and their shares of those at full size
     size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
     scale = np.array([size[0] / camera.width, size[1] / camera.height])
     _log_camera(rr, stream, camera, size, scale)
@@ -155,6 +158,7 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
     shown_layers: set[str] = set()
     state = ""
     for frame in frames:
+        # the frame's place on both time lines of the viewer: its index, and seconds from the start
         first_stamp = frame.stamp if first_stamp is None else first_stamp
         stream.set_time("frame", sequence=frame.index)
         stream.set_time("time", duration=frame.stamp - first_stamp)
@@ -170,7 +174,7 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
         if frame.state != state:
             stream.log("state", rr.TextLog(frame.state))
 
-        # features and mask; the viewer would show on those that this frame does not have
+        # features and mask; a layer that this frame lacks is cleared, or the viewer shows the last one
         layers = {} if frame.shot is None else _layers(rr, stream, frame.shot, size, scale)
         for layer in shown_layers - layers.keys():
             stream.log(LAYERS[layer], rr.Clear(recursive=False))
@@ -186,20 +190,25 @@ def _log_camera(
     """Log the camera, and how features and masks are drawn.
 
     Args:
-        rr: The library.
-        stream: The recording.
-        camera: Of the images at full size.
+        rr: The module ``rerun``.
+        stream: rerun's ``RecordingStream``.
+        camera: Intrinsics of the images at full size.
         size: Width and height of the images in the recording.
-        scale: What these are of those at full size.
+        scale: Recorded size over full size ``[2]`` (x, y).
     """
+    # intrinsics of the smaller images; rerun puts the corner of the first pixel at 0, we its centre
     matrix = camera.matrix * np.array([*scale, 1.0])[:, None]
-    matrix[:2, 2] += 0.5 * scale  # rerun puts the corner of the top-left pixel at 0, we its centre
+    matrix[:2, 2] += 0.5 * scale
     pinhole = rr.Pinhole(
         image_from_camera=matrix, width=size[0], height=size[1], camera_xyz=rr.ViewCoordinates.RDF
     )
+
+    # static pixels of a mask are transparent; x is right, y down, z forward
     classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.log(IMAGE, pinhole, classes, static=True)
+
+    # colours of kept and culled features
     for layer, colour in (("kept", KEPT), ("culled", CULLED)):
         points = rr.Points2D.from_fields(colors=[colour], radii=[1.0])
         stream.log(LAYERS[layer], points, static=True)
@@ -211,11 +220,11 @@ def _layers(
     """The features and the mask of a frame by their layers; logs how many features there are.
 
     Args:
-        rr: The library.
-        stream: The recording.
+        rr: The module ``rerun``.
+        stream: rerun's ``RecordingStream``.
         shot: Features ``[N, 2]`` in pixels of the image at full size, and the mask ``[H, W]``.
         size: Width and height of the images in the recording.
-        scale: Width and height of these over those at full size ``[2]``.
+        scale: Recorded size over full size ``[2]`` (x, y).
     """
     layers: dict[str, Any] = {}
     # rerun's origin is the corner of the first pixel, ours its centre
@@ -231,7 +240,7 @@ def _layers(
 
 
 def _blueprint() -> Any:
-    """What the viewer shows at first: the scene on the left, the image and the numbers on the right."""
+    """Layout that the viewer shows at first: the scene on the left, the image and the numbers on the right."""
     import rerun.blueprint as rrb
 
     numbers = rrb.Horizontal(
@@ -261,6 +270,7 @@ def write_stored(
         RunError: `rerun-sdk` is not installed, or a file of the run is damaged.
         SequenceError: An image cannot be read.
     """
+    # features, causal poses and numbers of the frames, each by the frame's index
     folder = store.folder(record.run_id)
     shots = _snapshots(folder, sequence.camera)
     online = store.trajectory(record.run_id, "online") or trajectory
@@ -285,6 +295,7 @@ def write_stored(
                 error_m=None if row is None else row.pose_error_trans_m,
             )
 
+    # the map, and the truth in the estimate's frame
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
     truth = aligned_truth(sequence.ground_truth, trajectory)[0]
     name = f"{record.tracker.label} on {record.sequence.id}"
@@ -301,8 +312,8 @@ def _snapshots(folder: Path, camera: Camera) -> dict[int, Snapshot]:
 
     Args:
         folder: The run's.
-        camera: Of the sequence's images, in pixels of which the features are given: the tracker's
-            preprocessing may have resized them.
+        camera: Intrinsics of the sequence's images. The features are given in their pixels, though
+            the tracker's preprocessing may have resized the images.
     """
     (height, width), snapshots = read_snapshots(folder)
     scale = np.array([camera.width / max(width, 1), camera.height / max(height, 1)])

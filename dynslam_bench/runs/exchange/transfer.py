@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,19 +38,19 @@ from dynslam_bench.runs.exchange.formats import (
     write_pose_table,
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
-from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.layout import TrajectoryKind
 from dynslam_bench.runs.make_record import (
     judge_coverage,
-    part_digest,
     recording_notes,
     sequence_info,
+    sequence_part_digest,
 )
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
-from dynslam_bench.sequences.view import Part, part_of
+from dynslam_bench.sequences.view import SequencePart, sequence_part_of
 from dynslam_bench.slam.map_files import read_ply
 
 _STAMP_TOLERANCE_S = 1e-5
@@ -65,18 +65,18 @@ PROVENANCE_FILE = "provenance.json"
 
 @dataclass(frozen=True)
 class Exported:
-    """What `export_run` wrote.
+    """Files that `export_run` wrote, with notes on what they lack.
 
     Attributes:
-        folder: Where.
+        folder: The folder of the export.
         files: Names of the files in it, ``provenance.json`` last.
-        which: Which trajectory.
+        which: The trajectory that was written: ``online`` or ``final``.
         notes: What a user should know, one line each.
     """
 
     folder: Path
     files: tuple[str, ...]
-    which: Which
+    which: TrajectoryKind
     notes: tuple[str, ...]
 
 
@@ -86,7 +86,7 @@ def export_run(
     folder: str | Path | None = None,
     *,
     results: str | Path | RunStore = "results",
-    which: Which | None = None,
+    which: TrajectoryKind | None = None,
     data_root: str | Path | None = None,
     camera: str | Path | None = None,
 ) -> Exported:
@@ -95,26 +95,27 @@ def export_run(
     Args:
         run: A record, or the run's id, its first digits or ``latest``.
         form: A name of `FORMATS`.
-        folder: Where; what it held is replaced. By default ``exports/<run id>/<format>`` of the
-            results folder.
+        folder: Folder of the export; what it held is replaced. By default
+            ``exports/<run id>/<format>`` of the results folder.
         results: The results folder, an archive of one, or a store.
-        which: Which trajectory; by default the final one, else the online one.
+        which: The trajectory to write; by default the final one, else the online one.
         data_root: Folder of the recorded sequences, for formats that need images or the camera
             (COLMAP, rerun).
-        camera: Camera of a folder that does not say its own, likewise.
+        camera: Camera of a folder that does not say its own, for these formats.
 
     Raises:
         RunError: There is no such run or format, or the run has no such trajectory.
         DynslamError: The sequence is not here although the format needs it, a library is missing,
             or the folder cannot be written.
     """
-    # what is asked for, and where it goes
+    # refuse what cannot be exported, and find the run
     if form not in FORMATS:
         raise RunError(f"there is no format '{form}'", did_you_mean(form, FORMATS))
     if folder is None and not isinstance(results, RunStore) and Path(results).is_file():
         raise RunError(f"{results} is an archive, which gets no exports", "name a folder, with -o")
     store = results if isinstance(results, RunStore) else open_store(results)
     record = store.read(run) if isinstance(run, str) else run
+
     # the trajectory, and the folder, which must be free or an earlier export
     chosen, trajectory = _trajectory(store, record, which)
     if folder is None:
@@ -125,7 +126,8 @@ def export_run(
         raise RunError(
             f"{target} exists and is no export", "name a folder that does not exist, with -o"
         )
-    # the files, then their digests beside what made them
+
+    # write the files, then their digests beside the run's record
     with atomic_folder(target) as work:
         notes = _write(
             form,
@@ -152,14 +154,14 @@ def _is_replaceable(folder: Path) -> bool:
 
 
 def _trajectory(
-    store: RunStore, record: RunRecord, which: Which | None
-) -> tuple[Which, Trajectory]:
+    store: RunStore, record: RunRecord, which: TrajectoryKind | None
+) -> tuple[TrajectoryKind, Trajectory]:
     """The trajectory of a run that is exported, and which it is; by default the final one, else the online one.
 
     Raises:
         RunError: The run has no such trajectory.
     """
-    wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
+    wanted: tuple[TrajectoryKind, ...] = ("final", "online") if which is None else (which,)
     for kind in wanted:
         if trajectory := store.trajectory(record.run_id, kind):
             return kind, trajectory
@@ -173,7 +175,7 @@ def _write(
     work: Path,
     store: RunStore,
     record: RunRecord,
-    which: Which,
+    which: TrajectoryKind,
     trajectory: Trajectory,
     reopened: Callable[[], Sequence],
 ) -> list[str]:
@@ -184,8 +186,8 @@ def _write(
         work: The folder.
         store: The run's.
         record: The run.
-        which: Which of its trajectories.
-        trajectory: That trajectory.
+        which: Kind of the trajectory, ``online`` or ``final``.
+        trajectory: The trajectory, camera-to-world poses.
         reopened: Opens the frames of the run, for formats that need images or the camera.
 
     Returns:
@@ -239,15 +241,17 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
     Returns:
         What a user should know, one line each.
     """
-    # poses of images alone: COLMAP has a pose for each image
+    # only poses with an image: COLMAP has one pose for each image
     rows_of_frames, rows_of_poses = associate(
         sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S
     )
-    # without files they are named as TUM names them
+
+    # names of these images; rendered ones get names as TUM gives them
     files: dict[float, str] = getattr(sequence, "colour_files", {})
     stamps = sequence.timestamps[rows_of_frames].tolist()
     names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in stamps]
-    # map points, and the poses of those images
+
+    # write the images with their poses, and the map's points
     points = read_ply(cloud) if cloud.is_file() else None
     poses = trajectory.select(np.asarray(rows_of_poses))
     write_colmap(work, poses, sequence.camera, names, points)
@@ -264,13 +268,13 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
 
 
 class Provenance(Record):
-    """What an export was made of.
+    """Origin of an export: its run and the digests of its files.
 
     Attributes:
-        schema_version: Of this record.
+        schema_version: Version of this record's fields.
         format: Name of the format.
         files: SHA-256 of every file by its name.
-        which: Which trajectory: ``online`` or ``final``.
+        which: The trajectory that was written: ``online`` or ``final``.
         run: The record of the run, without the command line and the folders of the machine that
             made it.
         written_by: Version of this package.
@@ -279,7 +283,7 @@ class Provenance(Record):
     schema_version: int = 1
     format: str
     files: dict[str, str]
-    which: Which
+    which: TrajectoryKind
     run: RunRecord
     written_by: str = ""
 
@@ -345,7 +349,7 @@ def open_stored(
     start, stop = record.frames or (0, None)
     place = record.place or record.sequence.id
     sequence = open_frames(place, data_root, camera, (start + record.offset, stop), record.stride)
-    if part_of(sequence, record.offset).content != record.sequence.content:
+    if sequence_part_of(sequence, record.offset).content != record.sequence.content:
         raise RunError(f"the content of {record.sequence.id} has changed since the run")
     return sequence
 
@@ -361,7 +365,7 @@ def import_trajectory(
     results: str | Path | RunStore = "results",
     label: str = "",
     provenance: str = "",
-    which: Which = "final",
+    which: TrajectoryKind = "final",
     frames: Frames = None,
     stride: int = 1,
     data_root: str | Path | None = None,
@@ -387,7 +391,7 @@ def import_trajectory(
         camera: Camera of a folder that does not say its own.
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one
             each, in seconds, for COLMAP a list of stamps and images.
-        topic: Of a bag with several topics of poses, the one to take.
+        topic: The topic to take of a bag that has several topics of poses.
         truth: Ground truth of a sequence whose images are not here, in a format of
             `read_trajectory`, with the same `timestamps` where it has none. Its frames are not
             known then, and so is the coverage.
@@ -416,25 +420,72 @@ def import_trajectory(
         phrases = truth_file.notes.describe(repeats=True)
         notes += [f"ground truth: {phrase}" for phrase in phrases]
         reference = _reference_by_truth(sequence, truth_file)
-    part = reference.part
 
     # which of its frames the trajectory covers
-    stamps_s = to_seconds(reference.timestamps_ns)
-    coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{part.id}'")
-    if not reference.knows_frames:
-        coverage = _Coverage.of_all(len(trajectory), coverage.n_without_frame)
-        notes.append(
-            "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
-        )
-    elif coverage.n_without_frame:
-        notes.append(
-            f"{coverage.n_without_frame} of {len(trajectory)} poses carry stamps that are no input frame's"
-        )
-    total = coverage.total
-    covered = coverage.covered
-    status, reason = judge_coverage(covered, total, total - 1 - coverage.last, total)
+    coverage = _coverage(trajectory, reference, file)
+    notes += _coverage_notes(coverage, reference, trajectory)
 
-    # an imported trajectory is identified by its file and by the frames that it belongs to
+    # its record, as that of a run: frames without a pose count as lost
+    identity = _identity_of_import(file, tracker, which, reference.part, timestamps, topic)
+    status, reason = judge_coverage(
+        coverage.covered,
+        coverage.total,
+        coverage.total - 1 - coverage.last,
+        coverage.total,
+    )
+    record = RunRecord(
+        kind="imported",
+        run_id=run_id_of(identity),
+        status=status,
+        reason=reason,
+        tracker=TrackerInfo(
+            id=tracker, label=label or f"{tracker} (imported)", provenance="external"
+        ),
+        sequence=reference.info(sequence_part_digest(identity)),
+        frames=None if frames is None else parse_frames(frames),
+        stride=stride,
+        n_frames=coverage.total,
+        n_tracked=coverage.covered,
+        n_lost=coverage.total - coverage.covered,
+        coverage=coverage.covered / coverage.total if reference.knows_frames else None,
+        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
+        versions=versions(),
+        identity=identity,
+        provenance=provenance or stated_provenance(file) or str(file),
+        place=place_of(sequence) if reference.knows_frames else "",
+        stamps_match=reference.knows_frames and not coverage.n_without_frame,
+        notes=[*notes, *reference.notes],
+    ).normalised()
+
+    # trajectory, stamps and ground truth into the store
+    store = results if isinstance(results, RunStore) else RunStore(results)
+    store.prepare()
+    with store.work_folder(record.run_id) as work:
+        comment = f"imported: {tracker} on {reference.part.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, reference.timestamps_ns, reference.ground_truth)
+        store.publish(work, record)
+    return record
+
+
+def _identity_of_import(
+    file: Path,
+    tracker: str,
+    which: TrajectoryKind,
+    part: SequencePart,
+    timestamps: str | Path | None,
+    topic: str | None,
+) -> dict[str, Any]:
+    """Identity of an imported trajectory: its file, and the frames that it belongs to.
+
+    Args:
+        file: The trajectory; its content counts, not its name.
+        tracker: Name of the system that made it.
+        which: Kind of the trajectory, ``online`` or ``final``.
+        part: The part of the sequence that it was made on.
+        timestamps: File of the stamps where the format has none; its content counts.
+        topic: The topic that was taken of a bag.
+    """
     identity = {
         "kind": "imported",
         "tracker": tracker,
@@ -450,45 +501,12 @@ def import_trajectory(
         identity["timestamps"] = digest_of(Path(timestamps).expanduser())
     if topic is not None:
         identity["topic"] = topic
-    # its record, as that of a run: frames without a pose count as lost
-    record = RunRecord(
-        kind="imported",
-        run_id=run_id_of(identity),
-        status=status,
-        reason=reason,
-        tracker=TrackerInfo(
-            id=tracker, label=label or f"{tracker} (imported)", provenance="external"
-        ),
-        sequence=reference.info(part_digest(identity)),
-        frames=None if frames is None else parse_frames(frames),
-        stride=stride,
-        n_frames=total,
-        n_tracked=covered,
-        n_lost=total - covered,
-        coverage=covered / total if reference.knows_frames else None,
-        started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
-        versions=versions(),
-        identity=identity,
-        provenance=provenance or stated_provenance(file) or str(file),
-        place=place_of(sequence) if reference.knows_frames else "",
-        stamps_match=reference.knows_frames and not coverage.n_without_frame,
-        notes=[*notes, *reference.notes],
-    ).normalised()
-
-    # trajectory, stamps and ground truth into the store
-    store = results if isinstance(results, RunStore) else RunStore(results)
-    store.prepare()
-    with store.work_folder(record.run_id) as work:
-        comment = f"imported: {tracker} on {part.id}"
-        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
-        store.add_sequence(record.sequence.part, reference.timestamps_ns, reference.ground_truth)
-        store.publish(work, record)
-    return record
+    return identity
 
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """What an imported trajectory is compared with.
+    """Stamps and ground truth that an imported trajectory is compared with.
 
     Attributes:
         part: The part of the sequence.
@@ -499,7 +517,7 @@ class _Reference:
         notes: What of the recording was not used, or nobody could mean.
     """
 
-    part: Part
+    part: SequencePart
     timestamps_ns: NDArray[np.int64]
     ground_truth: Trajectory | None
     info: Callable[[str], SequenceInfo]
@@ -509,7 +527,7 @@ class _Reference:
 
 def _reference_by_images(opened: Sequence) -> _Reference:
     """A sequence whose images are here."""
-    part = part_of(opened)
+    part = sequence_part_of(opened)
     return _Reference(
         part=part,
         timestamps_ns=timestamps_ns(opened),
@@ -533,16 +551,16 @@ def _reference_by_truth(sequence: str, truth: TumFile) -> _Reference:
     )
 
 
-def _part_by_truth(sequence: str, truth: Trajectory) -> Part:
+def _part_by_truth(sequence: str, truth: Trajectory) -> SequencePart:
     """The whole of a sequence of which only the ground truth is here."""
     entry = entry_of(sequence)
     content = digest([truth.timestamps_ns.tolist(), truth.T_world_cam.round(9).tolist()])
-    return Part(
+    return SequencePart(
         sequence if entry is None else entry.id, content, content, {}, 0, len(truth), 1, None
     )
 
 
-def _info_by_truth(part: Part, truth: Trajectory, name: str) -> SequenceInfo:
+def _info_by_truth(part: SequencePart, truth: Trajectory, name: str) -> SequenceInfo:
     """What is known of a sequence without its images: the catalogue's entry and the camera's motion.
 
     Args:
@@ -568,7 +586,7 @@ def _info_by_truth(part: Part, truth: Trajectory, name: str) -> SequenceInfo:
 
 
 class _Coverage(NamedTuple):
-    """Which frames of a sequence a trajectory covers.
+    """Coverage of a sequence's frames by a trajectory.
 
     Attributes:
         total: Frames of the sequence.
@@ -588,6 +606,55 @@ class _Coverage(NamedTuple):
         return cls(poses, poses, n_without_frame, poses - 1)
 
 
+def _share_of_time(stamps: Array, true_stamps: Array) -> float:
+    """The share of the ground truth's time between the first and the last pose; both stamps in seconds."""
+    start = max(float(stamps[0]), float(true_stamps[0]))
+    stop = min(float(stamps[-1]), float(true_stamps[-1]))
+    whole = float(true_stamps[-1] - true_stamps[0])
+    return max(stop - start, 0.0) / whole if whole > 0 else 1.0
+
+
+def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Coverage:
+    """Coverage of the reference's frames by a trajectory; each pose is a frame where the frames are not known.
+
+    Args:
+        trajectory: The trajectory.
+        reference: Stamps and ground truth of the sequence.
+        file: Its file, for the error.
+
+    Raises:
+        RunError: Fewer than two poses are near a frame.
+    """
+    stamps_s = to_seconds(reference.timestamps_ns)
+    coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{reference.part.id}'")
+    if reference.knows_frames:
+        return coverage
+    return _Coverage.of_all(len(trajectory), coverage.n_without_frame)
+
+
+def _coverage_notes(
+    coverage: _Coverage, reference: _Reference, trajectory: Trajectory
+) -> list[str]:
+    """Notes for the record on what is not known of the coverage, and on poses beside the frames.
+
+    Args:
+        coverage: The coverage.
+        reference: The sequence, by its images or by a ground truth alone.
+        trajectory: The trajectory.
+    """
+    if not reference.knows_frames:
+        span = _share_of_time(trajectory.timestamps, to_seconds(reference.timestamps_ns))
+        return [
+            "coverage is unknown: the images of the sequence were not here, and so its frames are not known; "
+            f"from its first to its last pose are {100 * span:.0f} % of the ground truth's time"
+        ]
+    if coverage.n_without_frame:
+        return [
+            f"{coverage.n_without_frame} of {len(trajectory)} poses carry stamps that are no input frame's"
+        ]
+    return []
+
+
 def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> _Coverage:
     """Match the poses of a trajectory with the frames of a sequence by their stamps.
 
@@ -600,7 +667,7 @@ def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str)
     Raises:
         RunError: Fewer than two poses are near a frame.
     """
-    # poses with a frame's own stamp, and poses near a frame
+    # poses with a frame's own stamp, and poses near a frame: others may have rounded the stamps
     exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
     near, _ = associate(stamps, trajectory.timestamps, _IMPORT_TOLERANCE_S)
     if len(near) < 2:

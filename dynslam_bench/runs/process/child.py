@@ -111,15 +111,15 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
     if job.get("recorded") is None:
         yield lambda: None
         return
-    from dynslam_bench.core.reads import Anchors, Reads
+    from dynslam_bench.core.reads import BaseFolders, Reads
     from dynslam_bench.core.stage_cache import record_reads
     from dynslam_bench.runs.process.recorder import ReadRecorder
 
     recorded = job["recorded"]
     plugin = None if recorded["plugin"] is None else Path(recorded["plugin"])
     folder = Path(job["folder"])
-    anchors = Anchors(plugin=plugin, work=Path(recorded["work"]))
-    recorder = ReadRecorder(anchors, private=[temporary, folder], plugins=recorded["packages"])
+    base_folders = BaseFolders(plugin=plugin, work=Path(recorded["work"]))
+    recorder = ReadRecorder(base_folders, private=[temporary, folder], plugins=recorded["packages"])
 
     def write(reads: Reads) -> None:
         (folder / READS_FILE).write_text(reads.to_json(), encoding="utf-8")

@@ -25,7 +25,7 @@ from dynslam_bench.core.reads import (
     COMMAND,
     SEARCH_PATHS,
     UNREADABLE,
-    Anchors,
+    BaseFolders,
     ImportPath,
     Reads,
     content_now,
@@ -125,7 +125,8 @@ class FileNote:
 
     Attributes:
         stamp: What it was then; None where it was not there.
-        digest: Of its content then; empty where it is still to be taken.
+        digest: Digest of the file's content when it was opened; empty where it is still to be
+            taken.
     """
 
     stamp: Stamp | None
@@ -134,7 +135,7 @@ class FileNote:
 
 @dataclass
 class Notes:
-    """What a recorder has noted so far.
+    """Files, folders, variables and commands that a recorder has noted so far.
 
     Attributes:
         files: Each file that was opened to be read.
@@ -190,17 +191,19 @@ class Collector:
     """Makes `Reads` of notes; knows what there was when the recorder was started, which is when this is made.
 
     Args:
-        anchors: The folders in which names of files begin.
-        origins: Whose files are.
+        base_folders: The folders in which names of files begin.
+        origins: Tells whose a file is.
         private: Beginnings of the paths of what the run owns.
     """
 
-    def __init__(self, anchors: Anchors, origins: Origins, private: tuple[str, ...]) -> None:
+    def __init__(
+        self, base_folders: BaseFolders, origins: Origins, private: tuple[str, ...]
+    ) -> None:
         self.notes = Notes()
         self.programs = ProgramReads()
         self.began_ns = time.time_ns()
         self.environment = dict(os.environ)
-        self._anchors = anchors
+        self._base_folders = base_folders
         self._origins = origins
         self._private = private
         self._path = list(sys.path)
@@ -212,10 +215,10 @@ class Collector:
         self._variables: dict[Command, set[str]] = {}
 
     def collect(self, modules: Modules) -> Reads:
-        """What was read so far.
+        """The record of what was read so far.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         imports = modules.imports
         programs, distributions = self._programs(imports)
@@ -238,7 +241,7 @@ class Collector:
         folders = {
             path: self._folder(path, names) for path, names in dict(self.notes.folders).items()
         }
-        links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
+        links = {path: link_now(path, self._base_folders) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
         variables |= self._variables_in(files)
         asked_for = {
@@ -246,7 +249,7 @@ class Collector:
         }
         used_distributions = modules.distributions.keys() | distributions | asked_for
 
-        name = self._anchors.name
+        name = self._base_folders.name
         return Reads(
             files={name(path): digest for path, digest in files.items()},
             folders={name(path): digest for path, digest in folders.items()},
@@ -282,7 +285,7 @@ class Collector:
 
     def _name(self, path: str) -> str:
         """The name of a file, or of a folder whose whole content counts."""
-        return self._anchors.name(path) + (os.sep if os.path.isdir(path) else "")
+        return self._base_folders.name(path) + (os.sep if os.path.isdir(path) else "")
 
     def _content(self, path: str, note: FileNote) -> str:
         """Digest of a file that was not taken when the file was opened."""
@@ -328,7 +331,7 @@ class Collector:
         """The search paths, and where commands were found that were named without a folder."""
         commands = {command.words[0] for command in dict(self.notes.commands)}
         names = (*SEARCH_PATHS, *(f"{COMMAND}{word}" for word in commands if os.sep not in word))
-        return {name: search_now(name, self.environment, self._anchors) for name in names}
+        return {name: search_now(name, self.environment, self._base_folders) for name in names}
 
     # -- what has changed while it was read --------------------------------------------------------
 
@@ -336,7 +339,7 @@ class Collector:
         """The first thing that has changed since it was read, in words; empty where nothing has.
 
         Args:
-            modules: Those that are loaded now.
+            modules: The modules that are loaded now.
         """
         for path, note in self.notes.files.items():
             self.compare(path, note, stamp_of(path))
@@ -423,11 +426,11 @@ class Collector:
         for top, file in file_of_top.items():
             module_file = imports.find(top)
             if module_file and file.startswith(module_file):  # else a plug-in has changed the path
-                modules.places[top] = imports.place(top, self._anchors)
+                modules.places[top] = imports.place(top, self._base_folders)
 
         # modules that were asked for and are not loaded
         for top in set(self.notes.modules) - sys.modules.keys():
-            modules.places[top] = imports.place(top, self._anchors)
+            modules.places[top] = imports.place(top, self._base_folders)
             distributions = imports.distributions_of(top, imports.find(top))
             modules.distributions |= dict.fromkeys(distributions, False)
 
@@ -525,8 +528,8 @@ class Collector:
     def _is_too_wide(self, folder: str) -> bool:
         """Whether a folder holds so much that a program that is told of it does not read it all."""
         places = [
-            str(self._anchors.work),
-            str(self._anchors.plugin),
+            str(self._base_folders.work),
+            str(self._base_folders.plugin),
             str(Path.home()),
             sys.prefix,
             *self._path,
@@ -612,9 +615,9 @@ class Collector:
 
     def _places_of(self, word: str, text: str) -> set[str]:
         """Where a file of that name could lie."""
-        folders = {os.path.dirname(text), str(self._anchors.work)}
-        if self._anchors.plugin is not None:
-            folders.add(str(self._anchors.plugin))
+        folders = {os.path.dirname(text), str(self._base_folders.work)}
+        if self._base_folders.plugin is not None:
+            folders.add(str(self._base_folders.plugin))
         path = os.path.expanduser(word)
         return {os.path.normpath(os.path.join(folder, path)) for folder in folders}
 

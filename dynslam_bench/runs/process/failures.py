@@ -118,7 +118,7 @@ def _is_out_of_memory(error: BaseException, text: str) -> bool:
 
 
 def _one_line(error: BaseException) -> str:
-    """What an exception says, on one line of bounded length."""
+    """The text of an exception on one line of bounded length."""
     return " ".join(str(error).split())[:_LONGEST_REASON]
 
 

@@ -54,7 +54,7 @@ PRELOADED = (
     "torch",
     "numba",
     "gymnasium",
-    "dynslam_bench.envs",
+    "dynslam_bench.envs.slam_env",
     "dynslam_bench.evaluation.evaluate",
     "dynslam_bench.slam.pipeline",
     "dynslam_bench.slam.backend",

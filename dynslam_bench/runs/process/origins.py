@@ -42,7 +42,7 @@ class Origins:
         self._of_file.clear()
 
     def of_frame(self, frame: FrameType) -> Origin:
-        """Whose the function is that runs in a frame; code without a file is Python's: its caller tells."""
+        """Origin of the function that runs in a frame; code without a file is Python's: its caller tells."""
         file = frame.f_code.co_filename
         origin = self._of_code.get(file)
         if origin is None:
@@ -56,14 +56,14 @@ class Origins:
         return module.partition(".")[0] in self._modules
 
     def of_file(self, file: str) -> Origin:
-        """Whose a file is."""
+        """Origin of a file."""
         origin = self._of_file.get(file)
         if origin is None:
             origin = self._of_file[file] = self._look(file)
         return origin
 
     def _look(self, file: str) -> Origin:
-        """Whose a file is, by the folders that it lies in."""
+        """Origin of a file, by the folders that it lies in."""
         if file.startswith("<"):  # frozen, or made from a text
             return "python"
         if file.startswith(self._own):

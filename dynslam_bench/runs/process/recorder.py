@@ -7,9 +7,9 @@ variables that they look up.
 Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``,
 ``onnxruntime``. In their place each file counts whose name is written in a plug-in's sources, or in
 a small text file that foreign code opened. So does each image and network in a folder that it
-listed. A file that sources name, or that a plug-in looks for, and that is not there counts as absent.
-Files that are named by a descriptor
-of their folder are not seen, nor is what comes from the network.
+listed. A file that sources name, or that a plug-in looks for, and that is not there counts as
+absent. Files that are named by a descriptor of their folder are not seen, nor is what comes from
+the network.
 
 Of programs counts what `core.programs` shows, what their command lines name, and the environment
 variables whose names are written in the command or in its files.
@@ -47,7 +47,7 @@ from dynslam_bench.core.programs import (
 from dynslam_bench.core.reads import (
     BYTE_CODE_FOLDER,
     SEARCH_PATHS,
-    Anchors,
+    BaseFolders,
     Reads,
     content_now,
     digest_of,
@@ -70,7 +70,8 @@ _FIRST_LOOK_S = 0.02
 _LOOK_S = 0.5
 """Seconds between two looks at the programs when the first ones are over; each comes after twice the time."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
-"""Number of the clock that stamps files, the coarse one; it moves on every 1 to 10 ms."""
+"""Number of the clock that stamps files: CLOCK_REALTIME_COARSE, which Python does not name. It moves on every 1 to 10
+ms."""
 _CLOCK_LAG_NS = 10_000_000
 """So far the clock that stamps files may be behind that of the system."""
 _ADAPTERS = "dynslam_bench.trackers.adapters"
@@ -100,7 +101,7 @@ class ReadRecorder:
     a time is at work.
 
     Args:
-        anchors: The folders in which names of files begin.
+        base_folders: The folders in which names of files begin.
         private: Folders of the run's own, at least one: what lies there is no input. Forked
             processes write their reads into the first one.
         plugins: Top-level names of the modules of installed plug-ins; their sources count by their
@@ -111,10 +112,10 @@ class ReadRecorder:
     """
 
     def __init__(
-        self, anchors: Anchors, *, private: Iterable[Path], plugins: Collection[str] = ()
+        self, base_folders: BaseFolders, *, private: Iterable[Path], plugins: Collection[str] = ()
     ) -> None:
         self.count = 0
-        self._anchors = anchors
+        self._base_folders = base_folders
         self._folders = list(private)
         self._plugins = plugins
         # threads in which the recorder itself is at work
@@ -161,8 +162,8 @@ class ReadRecorder:
         for folder in (*self._folders, stage_cache_folder(), digest_cache_folder()):
             private.append(f"{os.path.abspath(folder)}{os.sep}")
             private.append(f"{os.path.realpath(folder)}{os.sep}")
-        self._origins = Origins(self._anchors.plugin, self._plugins)
-        self._collector = Collector(self._anchors, self._origins, tuple(private))
+        self._origins = Origins(self._base_folders.plugin, self._plugins)
+        self._collector = Collector(self._base_folders, self._origins, tuple(private))
         self._notes = self._collector.notes
         listen(self.hear, self._handlers, self.begin_log)
 
@@ -192,7 +193,7 @@ class ReadRecorder:
         return self._collector.collect(modules)
 
     def so_far(self) -> Reads:
-        """What was read so far; it may change until the end."""
+        """The record of what was read so far; it may change until the end."""
         with self._ignoring_own_reads():
             return self._collector.collect(self._collector.modules())
 
@@ -520,7 +521,7 @@ class ReadRecorder:
             texts += _WORD_OF_CODE.findall(texts[texts.index("-c", 1) + 1])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
-            self._notes.commands[command] = _time_after_files_so_far()
+            self._notes.commands[command] = _program_start_ns()
             self._note("command", json.dumps([texts, command.folder]))
         self._note_variables(RESULT_VARIABLES)
         if self._watcher is None:
@@ -636,9 +637,10 @@ def _path_of_descriptor(descriptor: int) -> str | None:
     return path if is_file_name(path) else None
 
 
-def _time_after_files_so_far() -> int:
-    """A time in nanoseconds that is later than the stamps of all files written so far, and not of those written next.
+def _program_start_ns() -> int:
+    """The time (ns) that separates files written before a program starts from those written after.
 
+    The former may be its inputs, the latter its outputs.
     It waits for the next tick of the clock that stamps files. Where that clock cannot be read it
     gives the time less the most that the clock may be behind: files of the last moments then count
     as written next.

@@ -19,11 +19,11 @@ COCO_CLASSES: tuple[str, ...] = tuple(COCO_IDS.get(number, "") for number in ran
 """Names of classes 1..90 as torchvision's COCO models number them; unused numbers are empty."""
 
 Count = Annotated[int, Field(ge=1, le=4096)]
-"""Of channels, layers or pixels; the upper bound refuses files with an absurd shape."""
+"""A number of channels, layers or pixels; the upper bound refuses files with an absurd shape."""
 Blocks = Annotated[int, Field(ge=1, le=64)]
-"""Of residual blocks or layers."""
+"""A number of residual blocks or layers."""
 Side = Annotated[float, Field(gt=0, le=1e5)]
-"""Of a box, pixels; of an anchor's ratio as well."""
+"""Side of a box, pixels; also the ratio of an anchor's sides."""
 
 
 class NetworkConfig(BaseModel):
@@ -35,13 +35,13 @@ class NetworkConfig(BaseModel):
         blocks: Residual blocks of the four stages, e.g. (3, 4, 6, 3) for ResNet-50.
         bottleneck: Bottleneck blocks (ResNet-50 and deeper) or basic ones (ResNet-18 and -34).
         stem: Channels of the stem; 64 is full width, the stages have 1, 2, 4, 8 times as many.
-        channels: Of the feature pyramid and the RPN.
+        channels: Channels of the feature pyramid and the RPN.
         cfpn: Whether the mask branch takes cross-layer fused features.
         classes: Names of classes 1..n; 0 is background.
         anchor_sizes: One a pyramid level (P2..P6), input pixels.
         anchor_ratios: Height over width.
         box_hidden: Width of the box head's two layers.
-        mask_channels: Of the mask head's convolutions.
+        mask_channels: Channels of the mask head's convolutions.
         mask_layers: How many convolutions the mask head has.
         mask_pool: RoI resolution of the mask branch; masks have twice as many pixels a side.
         canonical: Box side (input pixels) that is assigned to P4.

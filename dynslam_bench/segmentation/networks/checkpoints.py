@@ -14,10 +14,10 @@ class Checkpoint:
     Attributes:
         id: Short name.
         file: Name in the cache.
-        url: Where it is published.
+        url: Address at which it is published.
         sha256_prefix: First digits of its SHA-256, as the publisher gives them in the file name.
         megabytes: Size, for messages.
-        license: Of the weights.
+        license: License of the weights.
         trained_on: Data set.
     """
 

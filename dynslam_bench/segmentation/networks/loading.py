@@ -22,7 +22,7 @@ from dynslam_bench.segmentation.networks.network import MaskRCNN
 FORMAT = "dynslam-bench/mask-rcnn/1"
 """Marks this project's files."""
 CFPN_PREFIX = "backbone.cfpn."
-"""Of the weights that torchvision's network does not have."""
+"""Begins the names of the weights that torchvision's network does not have."""
 _RENAMES = (
     (re.compile(r"^(backbone\.fpn\.(?:inner|layer)_blocks\.\d+)\.(weight|bias)$"), r"\1.0.\2"),
     (re.compile(r"^(rpn\.head\.conv)\.(weight|bias)$"), r"\1.0.0.\2"),

@@ -88,8 +88,8 @@ class RPN(nn.Module):
 
         Args:
             levels: P2..P6.
-            height: Of the padded input.
-            width: Of the padded input.
+            height: Height of the padded input, pixels.
+            width: Width of the padded input, pixels.
             sizes: Height and width of each image inside the padded input.
 
         Returns:
@@ -148,9 +148,9 @@ def rpn_loss(
     """Losses of objectness and of box codes (Ren et al. 2015, Eq. 1), 256 anchors an image, half of them positive.
 
     Args:
-        anchors: Of each level.
-        logits: Of each level ``[B, N_l]``.
-        codes: Of each level ``[B, N_l, 4]``.
+        anchors: Anchors ``[N_l, 4]`` of each level, input pixels.
+        logits: Objectness logits ``[B, N_l]`` of each level.
+        codes: Box codes ``[B, N_l, 4]`` of each level.
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
@@ -202,7 +202,7 @@ def roi_align(
     Args:
         features: Levels ``[B, C, H_l, W_l]``, finest first.
         boxes: One ``[K_b, 4]`` an image, input pixels.
-        image_height: Of the network's input; gives the levels' scales.
+        image_height: Height of the network's input, pixels; gives the levels' scales.
         size: Bins a side.
         canonical: Box side that goes to the third level.
 
@@ -308,6 +308,24 @@ def box_head(config: NetworkConfig) -> nn.Sequential:
     return nn.Sequential(layers)
 
 
+class Targets(NamedTuple):
+    """Proposals drawn from one image, the positive ones first, with what the heads are to answer.
+
+    Attributes:
+        rois: Boxes ``[P + N, 4]`` of the positive and the negative ones, input pixels.
+        classes: Class numbers ``[P + N]``, 0 for the negative ones.
+        codes: Box codes ``[P, 4]`` from the positive boxes to the true ones.
+        positives: Boxes ``[P, 4]`` of the positive ones.
+        masks: True masks inside these boxes ``[P, 2m, 2m]``, 0 or 1.
+    """
+
+    rois: Tensor
+    classes: Tensor
+    codes: Tensor
+    positives: Tensor
+    masks: Tensor
+
+
 class BoxPredictor(nn.Module):
     """Class scores and one box a class."""
 
@@ -367,13 +385,13 @@ class RoIHeads(nn.Module):
         """Objects of one image (inference).
 
         Args:
-            levels: P2..P5 ``[1, C, H, W]``.
-            mask_levels: m2..m5.
-            proposals: ``[K, 4]``.
-            image_height: Of the padded input.
+            levels: P2..P5 ``[1, C, H_l, W_l]``.
+            mask_levels: m2..m5, the mask branch's levels ``[1, C, H_l, W_l]``.
+            proposals: Boxes ``[K, 4]``, input pixels x0 y0 x1 y1.
+            image_height: Height of the padded input, pixels.
             size: Height and width of the image inside it.
             score: Least score.
-            iou: Of the suppression within a class.
+            iou: IoU above which the weaker of two boxes of one class is suppressed.
         """
         # classes and boxes of the proposals
         pooled = roi_align(
@@ -384,7 +402,7 @@ class RoIHeads(nn.Module):
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
 
-        # what is confident and not empty, suppressed within each class
+        # boxes that are confident and not empty, suppressed within each class
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         box = boxes[keep]
         best = scores[keep]
@@ -393,6 +411,8 @@ class RoIHeads(nn.Module):
         box = box[chosen]
         best = best[chosen]
         label = label[chosen]
+
+        # of each box the mask of its class
         mask_logits = self.masks(mask_levels, [box], image_height)
         masks = mask_logits[torch.arange(len(label), device=label.device), label].sigmoid()
         return Detections(box, label, best, masks)
@@ -413,7 +433,7 @@ class RoIHeads(nn.Module):
         proposals: list[Tensor],
         truths: list[Tensor],
         labels: list[Tensor],
-        masks: list[Tensor],
+        truth_masks: list[Tensor],
         image_height: int,
         generator: torch.Generator,
         per_image: int,
@@ -422,55 +442,69 @@ class RoIHeads(nn.Module):
 
         Args:
             levels: P2..P5.
-            mask_levels: m2..m5.
-            proposals: Of each image.
+            mask_levels: m2..m5, the mask branch's levels ``[B, C, H_l, W_l]``.
+            proposals: Boxes ``[P, 4]`` of each image, input pixels x0 y0 x1 y1.
             truths: Boxes ``[G, 4]`` of each image.
             labels: Class numbers ``[G]`` of each image.
-            masks: Bool ``[G, H, W]`` of each image, at the input's size.
-            image_height: Of the padded input.
+            truth_masks: Bool ``[G, H, W]`` of each image, at the input's size.
+            image_height: Height of the padded input, pixels.
             generator: Draws the sample.
             per_image: How many proposals an image enter the losses.
         """
         # draw proposals of each image, the true boxes among them; positive ones have targets
-        rois = []
-        classes = []
-        codes = []
-        positives = []
-        targets = []
-        for proposal, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
-            candidates = torch.cat([proposal, truth])
-            matched = match(candidates, truth, high=0.5, low=0.5, keep_best=False)
-            positive, negative = sample(
-                matched, count=per_image, positive_share=0.25, generator=generator
-            )
-            hits = matched[positive]
-            boxes = candidates[positive]
-            rois.append(torch.cat([boxes, candidates[negative]]))
-            classes.append(torch.cat([label[hits], label.new_zeros(len(negative))]))
-            codes.append(encode(truth[hits], boxes, BOX_WEIGHTS))
-            positives.append(boxes)
-            targets.append(crop_masks(mask[hits], boxes, 2 * self.config.mask_pool))
+        images = zip(proposals, truths, labels, truth_masks, strict=True)
+        drawn = [self._draw_targets(*image, generator, per_image) for image in images]
 
         # class and box of all that were drawn; only the codes of the true class are compared
+        rois = [image.rois for image in drawn]
         pooled = roi_align(levels, rois, image_height, BOX_POOL, canonical=self.config.canonical)
         logits, predicted = (output.float() for output in self.box_predictor(self.box_head(pooled)))
-        wanted = torch.cat(classes)
+        wanted = torch.cat([image.classes for image in drawn])
         foreground = torch.nonzero(wanted > 0)[:, 0]
         of_class = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
         class_loss = functional.cross_entropy(logits, wanted)
-        box_sum = functional.smooth_l1_loss(of_class, torch.cat(codes), beta=1 / 9, reduction="sum")
+        codes = torch.cat([image.codes for image in drawn])
+        box_sum = functional.smooth_l1_loss(of_class, codes, beta=1 / 9, reduction="sum")
         box_loss = box_sum / max(len(wanted), 1)
 
         # mask of the true class of the positive ones; without any a zero that has gradients
-        target = torch.cat(targets)
+        target = torch.cat([image.masks for image in drawn])
         mask_loss = mask_levels[0].sum() * 0
         if len(target):
+            positives = [image.positives for image in drawn]
             mask_logits = self.masks(mask_levels, positives, image_height).float()
             row = torch.arange(len(target), device=target.device)
+            # `wanted[foreground]` has the order of `positives`: they come first in each image
             mask_loss = functional.binary_cross_entropy_with_logits(
                 mask_logits[row, wanted[foreground]], target
             )
         return {"class": class_loss, "box": box_loss, "mask": mask_loss}
+
+    def _draw_targets(
+        self,
+        proposals: Tensor,
+        truths: Tensor,
+        labels: Tensor,
+        truth_masks: Tensor,
+        generator: torch.Generator,
+        count: int,
+    ) -> Targets:
+        """Draw `count` proposals of an image, a quarter of them positive at most, and their targets.
+
+        The arguments are those of `losses`, of one image.
+        """
+        candidates = torch.cat([proposals, truths])
+        matched = match(candidates, truths, high=0.5, low=0.5, keep_best=False)
+        positive, negative = sample(matched, count=count, positive_share=0.25, generator=generator)
+        hits = matched[positive]
+        boxes = candidates[positive]
+        return Targets(
+            rois=torch.cat([boxes, candidates[negative]]),
+            classes=torch.cat([labels[hits], labels.new_zeros(len(negative))]),
+            codes=encode(truths[hits], boxes, BOX_WEIGHTS),
+            positives=boxes,
+            masks=crop_masks(truth_masks[hits], boxes, 2 * self.config.mask_pool),
+        )
 
 
 def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:

@@ -161,8 +161,8 @@ class StaticMaskRCNN(nn.Module):
 
     Args:
         network: In inference mode; it is not changed.
-        height: Of the images.
-        width: Of the images.
+        height: Height of the images, pixels.
+        width: Width of the images, pixels.
         score: Least score of an object.
         iou: Overlap of two boxes of one class above which the weaker one is dropped.
     """

@@ -186,13 +186,13 @@ class SegmenterScore(Record):
         segmenter: The resolved source.
         weights: Digest of its file.
         data: The set of images.
-        images: How many.
+        images: Number of images.
         confidence: Least score of detections that count for IoU and recall.
         min_area: Smaller objects are left out.
         mean_ap: Mask AP (IoU 0.50 to 0.95), mean over the classes that occur.
         mean_iou: Pixel IoU, mean over the classes that occur.
-        classes: By class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall (see
-            `MaskTally.quality`).
+        classes: Scores by class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall
+            (see `MaskTally.quality`).
         median_ms: Median time of one image.
         threads: Threads the network could use.
     """

@@ -367,7 +367,7 @@ def rendered_frames(text: str = "") -> LabelledImages:
             )
         values[key] = value
 
-    # as numbers
+    # turn the texts of the options into numbers
     with translate_errors(
         SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError
     ):
@@ -643,7 +643,7 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         )
         value = value * rng.uniform(0.85, 1.15, 3).astype(np.float32)
 
-    # saturation
+    # change the saturation: 0 is grey, 1.6 is vivid
     if rng.random() < 0.3:
         grey = value.mean(axis=2, keepdims=True)
         value = grey + (value - grey) * np.float32(rng.uniform(0.0, 1.6))
@@ -673,7 +673,7 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
             cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32
         )
 
-    # noise
+    # add the noise of a sensor, at most 5 % of white
     if rng.random() < 0.4:
         value = value + rng.standard_normal(value.shape, np.float32) * np.float32(
             rng.uniform(0, 0.05)

@@ -77,7 +77,7 @@ class TrainResult:
         best: The averaged weights with the best validation score, in this project's checkpoint
             format.
         step: Step at which they were reached.
-        iou: Their mean IoU over the objects of the validation set.
+        iou: Mean IoU of these weights over the objects of the validation set.
     """
 
     best: Path

@@ -250,7 +250,7 @@ class TrainingRun:
                 f"training diverged at step {self.step}: the loss is {float(total)}"
             )
 
-        # backward
+        # one step down the clipped gradient, and into the moving average of the weights
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)

@@ -47,6 +47,10 @@ MILLIMETRES = 1000.0
 """Units a metre."""
 
 
+class NoRateError(SequenceError):
+    """Images are named by frame numbers, and nothing says how many there are a second."""
+
+
 def stated_file(folder: Path, *names: str) -> Path | None:
     """The first of these files that a folder has; None where it has none.
 
@@ -133,24 +137,48 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Suffixes of images, in small letters."""
 
 
-def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
+FOLDERS = {"rgb": ("rgb", "color", "colour", "image", "images"), "depth": ("depth",)}
+"""Names of the folders of colour and of depth images, TUM's first."""
+_NUMBERED = re.compile(r"(?P<before>[^0-9]*)(?P<number>[0-9]+)(?P<behind>[^0-9]*)", re.ASCII)
+"""A name with one whole number, such as ``frame_0001`` or ``0001.color``."""
+
+
+def image_folders(folder: Path, kind: str) -> list[str]:
+    """Names of the folders that may hold a sequence's images, the one to take first.
+
+    Args:
+        folder: The sequence's folder.
+        kind: ``rgb`` or ``depth``.
+    """
+    return [name for name in FOLDERS[kind] if (folder / name).is_dir()]
+
+
+def list_folder(folder: Path, kind: str, fps: float | None) -> ImageList:
     """The images of a folder without a list file, stamped by their names.
 
     A name with a decimal point is a stamp in seconds. Of whole numbers, those of the size of Unix
     time are stamps in seconds, milliseconds, microseconds or nanoseconds; others are frame numbers,
-    which `fps` turns into seconds.
+    which `fps` turns into seconds. Text around the numbers that is the same in all names counts
+    for nothing.
+
+    Args:
+        folder: The sequence's folder.
+        kind: ``rgb`` or ``depth``, see `image_folders`.
+        fps: Frame rate in Hz, where it is stated.
 
     Raises:
         SequenceError: The folder does not exist, or the names give no stamps.
     """
-    images = folder / name
-    if not images.is_dir():
+    present = image_folders(folder, kind)
+    if not present:
         raise SequenceError(
-            f"{folder} has neither {name}.txt nor a folder {name}",
+            f"{folder} has neither {kind}.txt nor a folder {' or '.join(FOLDERS[kind])}",
             "a sequence in TUM layout holds rgb.txt, depth.txt, the images, and groundtruth.txt where there is one",
         )
 
     # the images of the folder
+    name = present[0]
+    images = folder / name
     shown = sorted(path for path in images.iterdir() if not path.name.startswith("."))
     paths = [path for path in shown if path.suffix.lower() in _IMAGES]
     files = [f"{name}/{path.name}" for path in paths]
@@ -158,10 +186,11 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     # stamps by whole numbers, or each by its own name
     stamps: Sequence[int | None]
     missing = 0
-    if paths and all(path.stem.isascii() and path.stem.isdigit() for path in paths):
-        stamps, missing = stamps_of_numbers([int(path.stem) for path in paths], fps, files, folder)
+    numbered = _numbers_in([path.stem for path in paths])
+    if numbered:
+        stamps, missing = stamps_of_numbers(numbered, fps, files, folder)
     else:
-        hint = f"write {name}.txt with lines 'timestamp {name}/FILE'"
+        hint = f"write {kind}.txt with lines 'timestamp {name}/FILE'"
         stamps = [_number(path.stem, images, hint) for path in paths]
 
     # in order of time; other files and gaps are counted
@@ -169,6 +198,16 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     listed = make_image_list(rows, described=str(images))
     more = Counter({"files that are no images": len(shown) - len(paths), LEFT_OUT: missing})
     return ImageList(listed.stamps_ns, listed.files, listed.irregular + more)
+
+
+def _numbers_in(stems: list[str]) -> list[int]:
+    """The whole numbers in names that differ in nothing else; empty where there are other names."""
+    found = [_NUMBERED.fullmatch(stem) for stem in stems]
+    matches = [match for match in found if match is not None]
+    around = {(match["before"], match["behind"]) for match in matches}
+    if len(matches) < len(stems) or len(around) != 1:
+        return []
+    return [int(match["number"]) for match in matches]
 
 
 def rate_of(images: ImageList) -> float | None:
@@ -234,8 +273,9 @@ def stamps_of_numbers(
 
     # frame numbers: a rate turns them into time
     if fps is None:
-        kind = files[0].partition("/")[0]
-        raise SequenceError(
+        found = files[0].partition("/")[0]
+        kind = next((kind for kind, names in FOLDERS.items() if found in names), found)
+        raise NoRateError(
             f"{files[0]} of {folder} is named by a frame number, which has no time",
             f"write {kind}.txt with lines 'timestamp {files[0]}', or 'fps = 30' into the camera.toml that is used (the "
             "folder's, or the one that --camera names)",
@@ -501,7 +541,7 @@ def section(value: object, key: str, where: str) -> Any:
 
 
 def numbers(mapping: object, key: str, count: int, where: str) -> list[float]:
-    """The numbers of a list in a mapping, or of a matrix' ``data``.
+    """The numbers of a list in a mapping, or of an OpenCV matrix's ``data``.
 
     Args:
         mapping: What the file holds.
@@ -554,7 +594,7 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     return rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
 
 
-def camera_truth(
+def camera_poses_from_body(
     stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str
 ) -> TumFile | None:
     """The camera's true poses from those of a body, e.g. an IMU: ``T_world_cam = T_world_body @ T_body_cam``.

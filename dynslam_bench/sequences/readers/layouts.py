@@ -37,6 +37,7 @@ from dynslam_bench.sequences.readers.files import (
     camera_on_body,
     checked_camera,
     find_names,
+    image_folders,
     is_identity,
     list_folder,
     nanoseconds,
@@ -99,6 +100,10 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
             notes.append(
                 f"there is no {unlisted}.txt: the images of {unlisted}/ are stamped by their names"
             )
+
+        for name, path in lists.items():
+            taken, *others = image_folders(folder, name) if path is None else [""]
+            notes += [f"{other}/ is not used: {taken}/ is taken" for other in others]
 
     # a stated rate is that of the frame numbers, of which the images may be every n-th
     rate = rate_of(colour) if colour.irregular[LEFT_OUT] else None
@@ -571,7 +576,7 @@ def find_layout(folder: Path, catalogued: str = "") -> Layout:
 
 def is_plain(folder: Path) -> bool:
     """Whether a folder holds what TUM's reader takes without lists: images in two folders, or a list of pairs."""
-    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
+    if image_folders(folder, "rgb") and image_folders(folder, "depth"):
         return True
     return any(os.path.lexists(folder / name) for name in ASSOCIATIONS)
 

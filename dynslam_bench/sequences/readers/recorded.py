@@ -50,7 +50,7 @@ class RecordedSequence:
     Args:
         folder: The sequence's folder.
         contents: What its reader found in it.
-        camera: Of the colour images; its `R_body_cam` is applied to the ground truth.
+        camera: Intrinsics of the colour images; its `R_body_cam` is applied to the ground truth.
         id: For example ``tum/fr3/walking_xyz``.
         fps: Nominal frame rate in Hz; None to take it from the stamps, as is done where these
             contradict it.
@@ -59,6 +59,8 @@ class RecordedSequence:
         tags: For example ``high-dynamic``.
         split: ``tune``, ``held-out`` or empty.
         notes: Phrases for `dropped` on how the folder was read.
+        layout: Name of the folder's layout, for `taken_for`.
+        camera_source: What says which camera it is, for `taken_for`.
         max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
         any_depth_size: True if the caller resizes, so that depth images may differ in size from
             colour images.
@@ -66,7 +68,7 @@ class RecordedSequence:
     Attributes:
         folder: The sequence's folder.
         timestamps: Stamps of the colour images in seconds ``[N]``, strictly increasing.
-        timestamps_ns: The same in nanoseconds, int64 ``[N]``.
+        timestamps_ns: Stamps of the colour images in nanoseconds, int64 ``[N]``.
         depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's
             `depth_delay_s` added.
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps;
@@ -77,6 +79,8 @@ class RecordedSequence:
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
         remarks: Of that line the phrases that tell more than numbers of images and poses: files
             that were not used, a frame rate or a depth that nobody could mean.
+        taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
+            unit; ground truth, and all that was not taken as it stands.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -95,6 +99,8 @@ class RecordedSequence:
         tags: frozenset[str] = frozenset(),
         split: str = "",
         notes: tuple[str, ...] = (),
+        layout: str = "",
+        camera_source: str = "",
         max_time_difference_s: float = 0.02,
         any_depth_size: bool = False,
     ) -> None:
@@ -156,6 +162,21 @@ class RecordedSequence:
             *self.remarks,
         ]
         self.dropped = "; ".join(phrase for phrase in phrases if phrase)
+
+        # what the folder was taken for
+        unit = "depth in metres"
+        if camera.depth_factor is not None:
+            unit = f"{camera.depth_factor:g} raw depth units a metre"
+        of = [str(Path(files[0]).parent) for files in (self._colour, self._depth)]
+        rate = "stated" if fps is not None and not rate_note else "by the stamps"
+        self.taken_for = (
+            f"taken for layout {layout or 'unknown'}: colour in {of[0]}, depth in {of[1]}, {len(self)} frames at "
+            f"{self.fps:.4g} Hz ({rate})",
+            f"camera by {camera_source or 'the caller'}: {camera.width}x{camera.height}, fx {camera.fx:g}, "
+            f"fy {camera.fy:g}, {unit}",
+            "; ".join(phrase for phrase in phrases[1:] if phrase)
+            or "all images and poses are used",
+        )
 
     def _doubtful_depth(self, depth: NDArray[np.float32]) -> str:
         """A phrase where the first image's median depth is in no unit that its factor can mean; empty otherwise."""

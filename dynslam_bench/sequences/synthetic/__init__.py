@@ -75,9 +75,9 @@ def render_synthetic(
     """Render all frames of a sequence that are not cached yet; returns the folder, in TUM layout.
 
     Args:
-        id: As for `open_synthetic`.
-        cache_root: As for `open_synthetic`.
-        settings: As for `open_synthetic`.
+        id: Id of the sequence, e.g. ``synthetic/walking_xyz?scene=101&frames=150``.
+        cache_root: Folder under which the frames are cached, as ``cache_root/synthetic``.
+        settings: What differs from the default rendering (noise, controls, lighting).
         threads: Frames rendered at a time; None for the cores there are, at most four.
         progress: Called with (frames done, frames in all).
 

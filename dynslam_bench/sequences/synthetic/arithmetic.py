@@ -135,12 +135,12 @@ def power(x: float, exponent: float) -> float:
 
 
 def product(*factors: Array) -> Array:
-    """What ``a @ b @ ...`` is, stacks of matrices and vectors included, each sum from its first term to its last."""
+    """Product ``a @ b @ ...``, stacks of matrices and vectors included, each sum from its first term to its last."""
     return reduce(_product, factors)
 
 
 def _product(a: Array, b: Array) -> Array:
-    """What ``a @ b`` is, term by term."""
+    """The product ``a @ b``, summed term by term."""
     # a row vector times a matrix is the transposed matrix times that vector
     if a.ndim == 1 < b.ndim:
         a, b = np.swapaxes(b, -1, -2), a

@@ -16,13 +16,13 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, cos, norm, sin
 from dynslam_bench.sequences.synthetic.camera_paths import Walk, walk_along, walking_camera
-from dynslam_bench.sequences.synthetic.parts import Parts, box, copies, rotation_about_z
+from dynslam_bench.sequences.synthetic.parts import Primitives, box, copies, rotation_about_z
 from dynslam_bench.sequences.synthetic.rooms import (
     Point,
     cartons,
     corridor_bay,
     floor,
-    notices,
+    notice_bay,
     office_bay,
     office_chair,
     partition,
@@ -36,7 +36,7 @@ HALL_SPEED = 0.45
 
 
 class _Shape(NamedTuple):
-    """What differs between the buildings.
+    """Values in which the buildings differ.
 
     Attributes:
         aside_deg: How far the camera looks aside from where it walks, degrees.
@@ -68,14 +68,14 @@ class _LoosePiece(NamedTuple):
     """
 
     kind: str
-    parts: Parts
+    parts: Primitives
     yaw: float
     at: Point
 
 
 @dataclass
 class _Building:
-    """What is built so far; every stretch of wall and every loose piece has its number.
+    """The parts that are built so far; every stretch of wall and every loose piece has its number.
 
     Attributes:
         scene: The scene.
@@ -87,11 +87,13 @@ class _Building:
 
     scene: int
     repeated: bool
-    parts: Parts = field(default_factory=list)
+    parts: Primitives = field(default_factory=list)
     loose: list[_LoosePiece] = field(default_factory=list)
     bays: int = 0
 
-    def bay(self, make: Callable[[int, int], Parts], yaw: float, at: Point, alike: int = 0) -> None:
+    def bay(
+        self, make: Callable[[int, int], Primitives], yaw: float, at: Point, alike: int = 0
+    ) -> None:
         """Furnish a stretch of wall; where walls are repeated, all that are `alike` are the same."""
         number = alike if self.repeated else self.bays
         self.parts += copies(make(self.scene, number), yaw, (*at, 0.0), f"/{number}")
@@ -263,7 +265,7 @@ def _rooms(building: _Building) -> Walk:
             if k < 2:
                 at = (x + side * wide / 2, side * (half - 0.05))
                 building.bay(corridor_bay, 180.0 if side < 0 else 0.0, at)
-        building.bay(notices, -90.0 * side, (side * (ends - 0.05), 0.0), alike=7)
+        building.bay(notice_bay, -90.0 * side, (side * (ends - 0.05), 0.0), alike=7)
         # turn round at the end of the corridor
         turning = ((ends - 1.7, 0.6), (ends - 0.9, 0.1), (ends - 1.7, -0.6))
         corners += [(side * u, side * v) for u, v in turning]
@@ -288,9 +290,9 @@ def _furnish(
         building.bay(
             corridor_bay, -90.0 * end, (beside, side * (back - 2.6)), alike=1 if end > 0 else 2
         )
-        building.bay(notices, -90.0 * end, (beside, side * (front + 1.5)), alike=3)
-        building.bay(notices, yaw + 180.0, (x + end * 1.75, side * (front + 0.05)), alike=4)
-        building.bay(notices, yaw, (x + end * 1.55, side * (front - 0.05)), alike=5)
+        building.bay(notice_bay, -90.0 * end, (beside, side * (front + 1.5)), alike=3)
+        building.bay(notice_bay, yaw + 180.0, (x + end * 1.75, side * (front + 0.05)), alike=4)
+        building.bay(notice_bay, yaw, (x + end * 1.55, side * (front - 0.05)), alike=5)
     building.piece("chair", yaw, (x + 0.4, side * (back - 1.55)))
     building.piece("box", yaw, (x - 0.1 * wide, side * 3.9))
 

@@ -37,6 +37,8 @@ from dynslam_bench.sequences.synthetic.parts import (
     rotation_about_z,
 )
 from dynslam_bench.sequences.synthetic.people import (
+    FULL_GAIT_M_S,
+    STRIDE_M,
     Person,
     Posture,
     draw_person,
@@ -161,6 +163,8 @@ CROWDS = {
 
 Step = Callable[[Array], Array]
 """The common motion: times in seconds to the offset along x in metres."""
+DT_S = 0.05
+"""Time over which the speed of a side-step is measured."""
 
 
 def _step(reach: float, period: float, phase: float, times: Array) -> Array:
@@ -188,14 +192,15 @@ def build_synchronous(scene: int) -> World:
 
 
 def _stepping_posture(step: Step, place: tuple[float, float], time: float) -> Posture:
-    """A person who faces the camera and steps to the side, with a gait as fast as they move."""
-    x, ahead = step(np.array([time, time + 0.05]))
-    gait = min(abs(ahead - x) / 0.05 / 0.9, 1.0)
+    """Posture at `time` (s) of a person at `place` (x, y, m) who faces the camera and follows the common motion."""
+    x, x_later = step(np.array([time, time + DT_S]))
+    gait = min(abs(x_later - x) / DT_S / FULL_GAIT_M_S, 1.0)
     return Posture(
         x=place[0] + x,
         y=place[1],
         facing=180.0,
-        stride=2 * x * 2 * math.pi / 1.35,
+        # side-steps are half as long as steps forward, and the legs swing less
+        stride=2 * x * 2 * math.pi / STRIDE_M,
         gait=0.4 * gait,
         sit=0.0,
         gesture=0.1,

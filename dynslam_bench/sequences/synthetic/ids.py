@@ -65,12 +65,12 @@ class SyntheticId:
 
     @property
     def variant(self) -> Variant:
-        """What all scenes of this name share."""
+        """The settings that all scenes of this name share."""
         return VARIANTS[self.name]
 
     @property
     def split(self) -> Literal["tune", "held-out"]:
-        """Which split the scene belongs to."""
+        """Split that the scene belongs to."""
         return "held-out" if self.scene in HELD_OUT_SCENES else "tune"
 
     @property
@@ -95,7 +95,7 @@ def parse_synthetic_id(text: str) -> SyntheticId:
         raise SequenceError(
             f"'{text}' is not the id of a rendered sequence", did_you_mean(text, SYNTHETIC_IDS)
         )
-    # the name
+    # the name, one of `VARIANTS`
     name = match["name"]
     if name not in VARIANTS:
         near = did_you_mean(f"synthetic/{name}", SYNTHETIC_IDS)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, dividing_kernel
 from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
 from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
-from dynslam_bench.sequences.synthetic.textures import Atlas
+from dynslam_bench.sequences.synthetic.textures import TextureAtlas
 
 Ints = NDArray[np.integer]
 Reals = NDArray[np.floating]
@@ -71,7 +71,7 @@ class DepthModel(NamedTuple):
 
     Attributes:
         fx: Focal length, pixels.
-        baseline_m: From the camera to the projector.
+        baseline_m: Distance from the camera to the projector, metres.
         disparity_noise_px: Standard deviation of the disparity.
         near_m: Nothing nearer is measured.
         far_m: Nothing further is measured.
@@ -372,7 +372,7 @@ def shade_pixels(
     tiles: Tiles,
     primitives: Primitives,
     materials: Materials,
-    atlas: Atlas,
+    atlas: TextureAtlas,
     lights: Reals,
     hit: Ints,
     depth: Reals,
@@ -853,7 +853,7 @@ def measure_depth(
     Args:
         row0: First row.
         row1: One past the last row.
-        seed: Of this frame's noise.
+        seed: Seed of this frame's noise.
         sensor: The depth camera.
         depth: Exact z-depth ``[H, W]``, metres.
         cosine: Cosine of incidence ``[H, W]``.

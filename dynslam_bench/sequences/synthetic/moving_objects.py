@@ -14,10 +14,10 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import cos
 from dynslam_bench.sequences.synthetic.camera_paths import camera_poses
-from dynslam_bench.sequences.synthetic.parts import At, Key, Parts, box, copies, on_track
+from dynslam_bench.sequences.synthetic.parts import At, Key, Primitives, box, copies, on_track
 from dynslam_bench.sequences.synthetic.people import Draw, draw_person, posture
 from dynslam_bench.sequences.synthetic.rooms import (
-    Plan,
+    RoomPlan,
     balloon,
     build_room,
     door_leaf,
@@ -67,7 +67,7 @@ def build_objects(variant: str, scene: int) -> World:
 
 
 def _body(
-    id: int, name: str, parts: Parts, keys: tuple[At, ...], period: float | None = PERIOD_S
+    id: int, name: str, parts: Primitives, keys: tuple[At, ...], period: float | None = PERIOD_S
 ) -> Body:
     """A thing that moves along a timeline."""
     return Body(id, name, parts, partial(on_track, keys, period))
@@ -76,7 +76,7 @@ def _body(
 # The scripts. Their keys are times in seconds, places in metres and degrees about the vertical.
 
 
-def _balloon(draw: Draw, scene: int, plan: Plan) -> Script:
+def _balloon(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A person walks to and fro and plays with a balloon in front of the camera."""
     y = draw(0.95, 1.05)
     reach = draw(0.32, 0.42)
@@ -94,7 +94,7 @@ def _balloon(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "sports ball", toy, tuple(keys)),), tuple(walker))
 
 
-def _box_obstructing(draw: Draw, scene: int, plan: Plan) -> Script:
+def _box_obstructing(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A large carton is moved close across the view, held before it, and moved away again."""
     y = draw(1.15, 1.25)
     z = draw(1.06, 1.14)
@@ -115,7 +115,7 @@ def _box_obstructing(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "box", box, keys),))
 
 
-def _box_aside(draw: Draw, scene: int, plan: Plan) -> Script:
+def _box_aside(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A person carries a carton through the room; it never hides most of the view."""
     y = draw(1.3, 1.4)
     z = draw(0.95, 1.05)
@@ -136,7 +136,7 @@ def _box_aside(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "box", box, keys),), walker)
 
 
-def _carried(came: bool, draw: Draw, scene: int, plan: Plan) -> Script:
+def _carried(came: bool, draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A carton is brought and put down before the desk, where it stays; or it stands there and is taken away."""
     # time, x, and share of the carrying height at each station.
     if came:
@@ -173,7 +173,7 @@ def _carried(came: bool, draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((carton, stand), (*coming, *walker, Key(20, away, y + 0.5, 90)))
 
 
-def _kidnapped(draw: Draw, scene: int, plan: Plan) -> Script:
+def _kidnapped(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A very large carton comes before the camera, fills the image while it moves, and leaves."""
     y = draw(1.0, 1.1)
     z = draw(1.1, 1.2)
@@ -193,7 +193,7 @@ def _kidnapped(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "box", box, keys),))
 
 
-def _trolley(draw: Draw, scene: int, plan: Plan) -> Script:
+def _trolley(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A person pushes a loaded trolley to and fro before the desk."""
     y = draw(1.3, 1.4)
     stops = (
@@ -213,7 +213,7 @@ def _trolley(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "trolley", trolley(1, scene, plan), keys),), walker)
 
 
-def _chair(draw: Draw, scene: int, plan: Plan) -> Script:
+def _chair(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A chair with a carton on it is turned and rolled; no person is in view."""
     x = draw(-0.2, 0.2)
     y = draw(1.15, 1.25)
@@ -241,7 +241,7 @@ _DOOR = (-0.5, 1.55, 1.0)
 """Hinge x and y, and the width of the door, metres."""
 
 
-def _door(draw: Draw, scene: int, plan: Plan) -> Script:
+def _door(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A door in a partition opens towards the camera and falls shut, twice in a period."""
     x, y, width = _DOOR
     wide = draw(72, 80)
@@ -262,7 +262,7 @@ def _door(draw: Draw, scene: int, plan: Plan) -> Script:
     return Script((_body(1, "door", door_leaf(1, plan, width), keys),))
 
 
-def _doorway(plan: Plan) -> Parts:
+def _doorway(plan: RoomPlan) -> Primitives:
     """A wall before the desk, with a doorway, and posters on it."""
     x, y, width = _DOOR
     # walls on either side of the door
@@ -277,7 +277,7 @@ def _doorway(plan: Plan) -> Parts:
     return parts
 
 
-_SCRIPTS: dict[str, Callable[[Draw, int, Plan], Script]] = {
+_SCRIPTS: dict[str, Callable[[Draw, int, RoomPlan], Script]] = {
     "balloon": _balloon,
     "box_obstructing": _box_obstructing,
     "box_aside": _box_aside,

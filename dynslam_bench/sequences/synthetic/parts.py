@@ -44,7 +44,7 @@ class Primitive:
     tint: Array
 
 
-Parts = list[Primitive]
+Primitives = list[Primitive]
 """The primitives that a thing is made of."""
 
 
@@ -103,7 +103,9 @@ cone = partial(primitive, ROUND_CONE)
 quad = partial(primitive, QUAD)
 
 
-def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: str = "") -> Parts:
+def copies(
+    parts: Primitives, yaw: float, shift: tuple[float, float, float], suffix: str = ""
+) -> Primitives:
     """Copies of primitives.
 
     Args:

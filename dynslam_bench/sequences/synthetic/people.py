@@ -13,8 +13,8 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, power, product, sin
 from dynslam_bench.sequences.synthetic.parts import (
     Key,
-    Parts,
     Primitive,
+    Primitives,
     along,
     angle_between,
     between,
@@ -283,7 +283,7 @@ class _Figure:
         return cone(rotation, centre, (0.0, 1.0, 1.0), scale=radii, **style)
 
 
-def build_person(who: Person, how: Posture) -> Parts:
+def build_person(who: Person, how: Posture) -> Primitives:
     """The person's primitives, always as many and in the same order."""
     figure = _Figure(who, how)
     parts = [*_trunk(figure), *_head(figure)]
@@ -297,7 +297,7 @@ def build_person(who: Person, how: Posture) -> Parts:
 # widths by their build.
 
 
-def _trunk(figure: _Figure) -> Parts:
+def _trunk(figure: _Figure) -> Primitives:
     """Pelvis, belly and chest, shoulders; wider than deep."""
     k = figure.size
     b = figure.build
@@ -335,7 +335,7 @@ def _trunk(figure: _Figure) -> Parts:
     ]
 
 
-def _head(figure: _Figure) -> Parts:
+def _head(figure: _Figure) -> Primitives:
     """Neck and head, which looks about, with its hair and cap."""
     k = figure.size
     trunk = figure.trunk
@@ -366,7 +366,7 @@ def _head(figure: _Figure) -> Parts:
     return parts + _hair(figure, skull, head)
 
 
-def _hair(figure: _Figure, skull: Array, head: Array) -> Parts:
+def _hair(figure: _Figure, skull: Array, head: Array) -> Primitives:
     """Hair and cap: what covers the head.
 
     Args:
@@ -426,7 +426,7 @@ def _arm_angles(figure: _Figure, side: int) -> tuple[float, float, float]:
     return pitch, abduction, bend
 
 
-def _arm(figure: _Figure, side: int) -> Parts:
+def _arm(figure: _Figure, side: int) -> Primitives:
     """Upper arm, forearm, hand and thumb of the left (-1) or right (1) side."""
     k = figure.size
     b = figure.build
@@ -463,7 +463,7 @@ def _arm(figure: _Figure, side: int) -> Parts:
     ]
 
 
-def _leg(figure: _Figure, side: int, index: int) -> Parts:
+def _leg(figure: _Figure, side: int, index: int) -> Primitives:
     """Thigh, shin and shoe of the left (-1, index 0) or right (1, index 1) side."""
     k = figure.size
     b = figure.build
@@ -497,9 +497,9 @@ def _leg(figure: _Figure, side: int, index: int) -> Parts:
 
 Draw = Callable[[float, float], float]
 """A number between two limits, drawn from a scene's stream."""
-_STRIDE_M = 1.35
+STRIDE_M = 1.35
 """Path of two steps, in which the gait's phase advances by 2 pi."""
-_FULL_GAIT_M_S = 0.9
+FULL_GAIT_M_S = 0.9
 """Speed from which a person walks at full stride."""
 
 
@@ -671,8 +671,8 @@ def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
         x=before.x + eased * (after.x - before.x),
         y=before.y + eased * (after.y - before.y),
         facing=facing,
-        stride=(walked + distance * eased) * 2 * math.pi / _STRIDE_M,
-        gait=min(speed / _FULL_GAIT_M_S, 1.0),
+        stride=(walked + distance * eased) * 2 * math.pi / STRIDE_M,
+        gait=min(speed / FULL_GAIT_M_S, 1.0),
         sit=before.sit + eased * (after.sit - before.sit),
         gesture=before.gesture + eased * (after.gesture - before.gesture),
         clock=t,

@@ -44,7 +44,8 @@ _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 
 """Samples of a pixel on an edge (a rotated grid), pixels from its centre."""
 
 _ROW_ITERATIONS = 5
-"""Of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
+"""Iterations of the search for the row that sees a point. Each shrinks the error to a tenth or less: a point moves by
+at most 0.1 rows while one row is read."""
 _MARGIN_PX = 2.0
 """Added around the bounds of a primitive in the image."""
 _SAMPLED_ROWS = 9
@@ -391,7 +392,7 @@ class Renderer:
         return rows
 
     def _facets(self, view: View, pose: Array, lights: Array, texel_density: Array) -> Array:
-        """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
+        """Values of each face ``[P, 6, 5]``: its normal in the camera frame, light, texels a pixel at 1 m."""
         # Normals of boxes point outwards, those of quads along their z axis ...
         quads = self.scene.kind == QUAD
         axes = product(pose[:3, :3].T, view.rotation).transpose(0, 2, 1)

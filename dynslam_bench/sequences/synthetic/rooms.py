@@ -12,12 +12,19 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, norm, product
-from dynslam_bench.sequences.synthetic.parts import Parts, box, cone, quad, rotation_about_z, wall
+from dynslam_bench.sequences.synthetic.parts import (
+    Primitives,
+    box,
+    cone,
+    quad,
+    rotation_about_z,
+    wall,
+)
 from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
 
 
 @dataclass(frozen=True)
-class Plan:
+class RoomPlan:
     """Sizes, places and colours of the room of a scene.
 
     Attributes:
@@ -61,7 +68,7 @@ def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
     return half[int(rng.integers(len(half)))]
 
 
-def plan_room(scene: int, number: int | None = None) -> Plan:
+def plan_room(scene: int, number: int | None = None) -> RoomPlan:
     """Draw the plan of a scene's room, or of one of its several rooms."""
     # the stream of draws; a scene's only room and its first of several are different rooms
     one_of_several = () if number is None else (number,)
@@ -88,7 +95,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
         "bin": color(0.2, 0.6, 0.4),
     }
     # sizes and places, in this order of draws
-    return Plan(
+    return RoomPlan(
         back_y=pick(rng, scene, 3.35, 3.75),
         left_x=-pick(rng, scene, 1.9, 2.4),
         right_x=pick(rng, scene, 1.9, 2.4),
@@ -102,7 +109,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
-def glare_window(plan: Plan) -> tuple[float, float, float]:
+def glare_window(plan: RoomPlan) -> tuple[float, float, float]:
     """The place beside the back wall where glare comes from, metres."""
     return plan.left_x * 0.55, plan.back_y, 2.15
 
@@ -117,7 +124,7 @@ _EYE = np.eye(3)
 """Rotation of what stands along the world's axes."""
 
 
-def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
+def desk(rng: np.random.Generator, plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
     return [
         *_table(plan, x, y, half),
@@ -129,7 +136,7 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
     ]
 
 
-def _table(plan: Plan, x: float, y: float, half: float) -> Parts:
+def _table(plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """The top of a desk, its sides and back, and a unit of three drawers."""
     tint = plan.tints
     wood: Style = {"texture": "wood", "tint": tint["desk"]}
@@ -162,9 +169,9 @@ def _table(plan: Plan, x: float, y: float, half: float) -> Parts:
     return parts
 
 
-def _papers(rng: np.random.Generator, x: float, y: float, half: float) -> Parts:
+def _papers(rng: np.random.Generator, x: float, y: float, half: float) -> Primitives:
     """Five sheets, each lying a little higher than the one before."""
-    parts: Parts = []
+    parts: Primitives = []
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
         turned = rotation_about_z(rng.random() * 50 - 25)
@@ -174,9 +181,9 @@ def _papers(rng: np.random.Generator, x: float, y: float, half: float) -> Parts:
     return parts
 
 
-def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Parts:
+def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Primitives:
     """A pile of books at either end."""
-    parts: Parts = []
+    parts: Primitives = []
     for k in range(2):
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
@@ -193,9 +200,9 @@ def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Pa
     return parts
 
 
-def _mugs(rng: np.random.Generator, x: float, y: float) -> Parts:
+def _mugs(rng: np.random.Generator, x: float, y: float) -> Primitives:
     """A plain mug and one with stripes."""
-    parts: Parts = []
+    parts: Primitives = []
     for k in range(2):
         at = (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012)
         style: Style = {
@@ -207,7 +214,7 @@ def _mugs(rng: np.random.Generator, x: float, y: float) -> Parts:
     return parts
 
 
-def _lamp(plan: Plan, x: float, y: float, half: float) -> Parts:
+def _lamp(plan: RoomPlan, x: float, y: float, half: float) -> Primitives:
     """Foot, rod and shade of a lamp, at the end without drawers."""
     tint = plan.tints
     side = 1 if plan.mirrored else -1
@@ -228,11 +235,13 @@ _FRAME = (
 """Bars around a monitor's picture: middle and half extents along both of its sides, metres."""
 
 
-def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
+def _monitors(
+    rng: np.random.Generator, plan: RoomPlan, x: float, y: float, half: float
+) -> Primitives:
     """Monitors, each with its foot, a keyboard and a mouse."""
     plastic = plan.tints["plastic"]
     spacing = 2 * half / (plan.monitors + 0.6)
-    parts: Parts = []
+    parts: Primitives = []
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
         facing = rotation_about_z((rng.random() - 0.5) * 24)
@@ -259,7 +268,7 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
     return parts
 
 
-def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
+def shelf(rng: np.random.Generator, plan: RoomPlan, side: int) -> Primitives:
     """A bookcase against the back wall with rows of books and boxes."""
     wood: Style = {"texture": "wood", "tint": plan.tints["shelf"]}
     darker: Style = wood | {"tint": plan.tints["shelf"] * 0.8}
@@ -297,7 +306,7 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     return parts
 
 
-def posters(rng: np.random.Generator, plan: Plan) -> Parts:
+def posters(rng: np.random.Generator, plan: RoomPlan) -> Primitives:
     """Posters on the back wall."""
     parts = []
     span = plan.right_x - plan.left_x - 1.6
@@ -309,7 +318,7 @@ def posters(rng: np.random.Generator, plan: Plan) -> Parts:
     return parts
 
 
-def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
+def cabinet(rng: np.random.Generator, plan: RoomPlan, side: int) -> Primitives:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
     tint = plan.tints
     y = plan.back_y - 0.25
@@ -334,7 +343,7 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     return [*parts, cone(_EYE, bin_at, (0.16, 0.12, 0.14), tint=tint["bin"])]
 
 
-def _plant(rng: np.random.Generator, pot: Array) -> Parts:
+def _plant(rng: np.random.Generator, pot: Array) -> Primitives:
     """A pot and nine leaves that lean outwards from its middle."""
     parts = [cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))]
     stem = pot + np.array([0, 0, 0.14])
@@ -354,7 +363,7 @@ def _plant(rng: np.random.Generator, pot: Array) -> Parts:
     return parts
 
 
-def build_room(scene: int, plan: Plan) -> Parts:
+def build_room(scene: int, plan: RoomPlan) -> Primitives:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     # extents of the room
     rng = stream(scene, "synthetic", "furniture")
@@ -410,7 +419,7 @@ _LINTEL_M = 2.1
 Point = tuple[float, float]
 
 
-def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Parts:
+def floor(low: Point, high: Point, plan: RoomPlan, shift: Point = (0.0, 0.0)) -> Primitives:
     """Floor and ceiling of a rectangle; `shift` is that of the carpet's texture."""
     middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
     half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
@@ -423,12 +432,14 @@ def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Par
     ]
 
 
-def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = ()) -> Parts:
+def partition(
+    start: Point, end: Point, plan: RoomPlan, doors: tuple[float, ...] = ()
+) -> Primitives:
     """A wall 0.1 m thick with doorways.
 
     Args:
         start: One end, metres.
-        end: The other.
+        end: Other end, metres.
         plan: Its colour.
         doors: Middles of the doorways, metres from `start`, in order.
     """
@@ -454,7 +465,7 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
     return parts
 
 
-def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
+def _stretch(scene: int, number: int, half: float) -> tuple[RoomPlan, np.random.Generator]:
     """The plan of a stretch of wall along y = 0, from x = -half to half, and the stream of its draws.
 
     Args:
@@ -468,7 +479,7 @@ def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Gene
     return plan, stream(scene, "synthetic", "bay", number)
 
 
-def office_bay(scene: int, number: int) -> Parts:
+def office_bay(scene: int, number: int) -> Primitives:
     """Four metres of an office's wall: desk, shelf, cabinet, posters."""
     plan, rng = _stretch(scene, number, 2.0)
     return [
@@ -479,7 +490,7 @@ def office_bay(scene: int, number: int) -> Parts:
     ]
 
 
-def corridor_bay(scene: int, number: int) -> Parts:
+def corridor_bay(scene: int, number: int) -> Primitives:
     """Two metres of a corridor's wall: posters, a shelf, a closed door or a notice board."""
     plan, rng = _stretch(scene, number, 0.7)
     kind = number % 4
@@ -504,14 +515,15 @@ def corridor_bay(scene: int, number: int) -> Parts:
     return parts
 
 
-def notices(scene: int, number: int) -> Parts:
-    """Nearly two metres of wall with four sheets on it at different heights."""
+def notice_bay(scene: int, number: int) -> Primitives:
+    """Two metres of wall along y = 0 with four sheets, 1.15 to 1.75 m high; `number` seeds the draw."""
     rng = stream(scene, "synthetic", "notices", number)
     parts = []
     for k in range(4):
-        half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
+        # upright or lying, metres
+        half_extents = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
         at = (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random())
-        parts.append(box(_EYE, at, half, texture=f"poster:{k}", fit=(2,)))
+        parts.append(box(_EYE, at, half_extents, texture=f"poster:{k}", fit=(2,)))
     return parts
 
 
@@ -525,7 +537,7 @@ _PRINT: Style = {
 }
 
 
-def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
+def office_chair(plan: RoomPlan, instance: int, shade: float = 1.0) -> Primitives:
     """An office chair facing -y: seat, back, column, five-pointed base; the origin lies on the floor."""
     metal = plan.tints["metal"]
     hub = np.array([0, 0, 0.09])
@@ -564,7 +576,7 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
     return parts
 
 
-def cartons(scene: int, number: int, id: int) -> Parts:
+def cartons(scene: int, number: int, id: int) -> Primitives:
     """Two printed cartons on each other."""
     parts = []
     rng = stream(scene, "synthetic", "cartons", number)
@@ -585,12 +597,12 @@ def cartons(scene: int, number: int, id: int) -> Parts:
     return parts
 
 
-def printed_box(id: int, half: tuple[float, float, float]) -> Parts:
+def printed_box(id: int, half: tuple[float, float, float]) -> Primitives:
     """A carton with a print on every side; its origin is its middle."""
     return [box(_EYE, np.zeros(3), half, instance=id, **_PRINT)]
 
 
-def balloon(id: int, radius: float) -> Parts:
+def balloon(id: int, radius: float) -> Primitives:
     """A printed balloon with its knot; the origin is its middle."""
     skin: Style = {"texture": "print:balloon", "repeat": (2.0, 2.0), "scale": (1.0, 1.0, 1.15)}
     knot = (0.0, 0.0, -1.2 * radius)
@@ -600,7 +612,7 @@ def balloon(id: int, radius: float) -> Parts:
     ]
 
 
-def trolley(id: int, scene: int, plan: Plan) -> Parts:
+def trolley(id: int, scene: int, plan: RoomPlan) -> Primitives:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
     rng = stream(scene, "synthetic", "trolley")
     bottom = 0.18
@@ -623,7 +635,7 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
     return parts
 
 
-def door_leaf(id: int, plan: Plan, width: float) -> Parts:
+def door_leaf(id: int, plan: RoomPlan, width: float) -> Primitives:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
     wood: Style = {"instance": id, "texture": "wood", "tint": plan.tints["door"]}
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}

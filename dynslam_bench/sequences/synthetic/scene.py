@@ -15,7 +15,7 @@ import numpy as np
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic import textures
 from dynslam_bench.sequences.synthetic.arithmetic import Array, norm, product
-from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Parts
+from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE, Primitives
 from dynslam_bench.sequences.synthetic.people import Person, Posture, build_person
 from dynslam_bench.sequences.synthetic.settings import CAMERA, DEFAULT_FRAMES, FPS, RenderSettings
 from dynslam_bench.sequences.tags import Tag
@@ -37,7 +37,7 @@ class Body:
 
     instance: int
     name: str
-    parts: Parts
+    parts: Primitives
     path: Placement
 
 
@@ -50,8 +50,8 @@ class Optics:
     """Settings of a sequence's sensors that differ from the defaults.
 
     Attributes:
-        readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The
-            frame's stamp and pose belong to the middle of the image.
+        readout_s: Seconds from the first row's exposure to the last one's; 0 is a global shutter.
+            The frame's stamp and pose belong to the middle of the image.
         auto_exposure: 0 keeps the exposure, 1 brings every image to the same mean brightness.
         gain: Brightness of the lamps, or what gives it for a time in seconds.
         color: Settings of `ColorSensor` that differ, where the user left them.
@@ -78,7 +78,7 @@ class World:
         optics: The sensors.
     """
 
-    static: Parts
+    static: Primitives
     camera: Callable[[Array], Array]
     window: tuple[float, float, float]
     bodies: tuple[Body, ...] = ()
@@ -191,7 +191,7 @@ class Scene:
         """How frame `index` sees the scene."""
 
     @cached_property
-    def atlas(self) -> textures.Atlas:
+    def atlas(self) -> textures.TextureAtlas:
         """The scene's textures; drawn when the first frame is coloured."""
         drawn = []
         for name in self.texture_names:

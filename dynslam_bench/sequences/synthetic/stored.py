@@ -18,8 +18,8 @@ class Rendering:
     """The stored frames of one rendered sequence.
 
     Attributes:
-        folder: Where they lie.
-        size: Of all files together, in bytes.
+        folder: Folder in which they lie.
+        size: Size of all files together, bytes.
         is_current: Whether this code reads them, at the default rendering settings.
     """
 
@@ -32,7 +32,7 @@ def renderings(cache_root: Path) -> list[Rendering]:
     """The renderings below a folder of sequences, sorted by their names.
 
     Args:
-        cache_root: As for `open_synthetic`.
+        cache_root: Folder under which rendered frames are cached, as ``cache_root/synthetic``.
     """
     stored = []
     for folder in sorted((cache_root / "synthetic").glob("*@*")):

@@ -12,7 +12,7 @@ Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""
 
 
-class Atlas(NamedTuple):
+class TextureAtlas(NamedTuple):
     """All T textures and their mip levels as one array.
 
     Attributes:
@@ -31,8 +31,12 @@ _LEVELS = 12
 """Mip levels of a texture, at most: of an edge of 2048 texels."""
 
 
-def build_atlas(textures: list[Image]) -> Atlas:
-    """Pack textures; each is halved by 2x2 means down to one texel."""
+def build_atlas(textures: list[Image]) -> TextureAtlas:
+    """Pack textures with their mipmaps: each is halved by 2x2 means down to one texel.
+
+    Args:
+        textures: Colours ``[S, S, 3]`` from 0 to 255, red first; S is a power of two.
+    """
     level_offset = np.zeros((len(textures), _LEVELS), np.int64)
     log2_size = np.zeros(len(textures), np.int32)
     parts: list[NDArray[np.uint8]] = []
@@ -43,6 +47,7 @@ def build_atlas(textures: list[Image]) -> Atlas:
         for level in range(_LEVELS):
             # levels that the texture does not have are its last one
             level_offset[index, level:] = position
+            # four bytes a texel, so that its address is a shift; the last byte stays empty
             texels = np.zeros((*current.shape[:2], 4), np.uint8)
             texels[..., :3] = np.floor(current + 0.5)
             parts.append(texels.ravel())
@@ -52,7 +57,7 @@ def build_atlas(textures: list[Image]) -> Atlas:
             current = 0.25 * (
                 current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]
             )
-    return Atlas(np.concatenate(parts), level_offset, log2_size)
+    return TextureAtlas(np.concatenate(parts), level_offset, log2_size)
 
 
 def smooth_noise(

@@ -229,7 +229,7 @@ class BatchTracker:
 
         Args:
             filled: The program's command and variables.
-            folder: Of the run; the program works in ``work`` below it.
+            folder: Folder of the run; the program works in ``work`` below it.
 
         Returns:
             The exit code; None if it had to be killed. `measured` has ``program_s``, and

@@ -199,6 +199,6 @@ class Container:
 
 
 def container_variables(environment: Mapping[str, str], declared: Iterable[str]) -> dict[str, str]:
-    """Those variables of a run that a container gets: what means the same there, and what is declared."""
+    """The variables of a run that a container gets: variables that mean the same there, and declared ones."""
     names = (*_CONTAINER_VARIABLES, *declared)
     return {name: environment[name] for name in names if name in environment}

@@ -74,7 +74,7 @@ class ConstantVelocity:
                 motion, inliers = relative_motion(self._camera, *self._previous, grey)
             self._previous = grey, frame.depth
 
-        # else extrapolate
+        # any other frame: go on with the mean velocity of the first ones
         if motion is None:
             motion = se3.exp(self._velocity * (frame.timestamp - self._stamp))
         self._pose = self._pose @ motion

@@ -217,14 +217,14 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
         TrackerError: Another camera model, intrinsics that are none, or an image too small for the
             pyramid.
     """
-    # the model
+    # the camera model: a pinhole with five coefficients
     if type(camera) is not Camera or len(camera.distortion) != 5:
         raise TrackerError(
             f"orbslam3 cannot take a {type(camera).__name__} with {len(camera.distortion)} distortion coefficients",
             "its RGB-D mode knows the pinhole camera with k1 k2 p1 p2 k3 only; undistort the images",
         )
 
-    # the numbers
+    # intrinsics that are finite and positive
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m, *camera.distortion)
     if (
         not all(math.isfinite(value) for value in values)

@@ -87,7 +87,7 @@ class ProgramSetting(Record):
     """A setting as a file declares it; its type is that of its default value.
 
     Attributes:
-        default: What it is where nothing else is said.
+        default: Value where nothing else is said.
         low: Lower end of the range that studies search, inclusive.
         high: Upper end of that range, inclusive.
         limits: What the program takes, where that is wider than the range.
@@ -193,7 +193,7 @@ def read_declared(table: Mapping[str, Any], where: str, prefix: str = "") -> Dec
     Args:
         table: Name to the fields of `ProgramSetting`, or to a group.
         where: The file, for messages.
-        prefix: Of the names; ends in a dot, or is empty.
+        prefix: Prefix of the names: ends in a dot, or is empty.
 
     Raises:
         SettingsError: A name or a field does not fit.
@@ -310,7 +310,7 @@ class ProgramFile(Record):
 
     @property
     def decisive(self) -> dict[str, Any]:
-        """What of it decides a result, settings apart: words about it and ranges of settings do not."""
+        """The fields that decide a result, settings apart: words about the program and ranges of settings do not."""
         words = {"name", "settings", "presets", "version", "license", "citation"}
         return self.model_dump(mode="json", exclude=words)
 
@@ -779,7 +779,7 @@ def describe_batch(value: str) -> dict[str, Any]:
 
 
 def describe_served(value: str) -> dict[str, Any]:
-    """The same for `subprocess:FILE.toml`; nothing for `subprocess:COMMAND`.
+    """What the file of `subprocess:FILE.toml` says, as fields of its `TrackerSpec`; empty for `subprocess:COMMAND`.
 
     Raises:
         SettingsError: It is damaged.

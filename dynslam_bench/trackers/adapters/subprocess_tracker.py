@@ -296,7 +296,7 @@ def read_track_answer(
     Raises:
         TrackerError: It is no valid result, see `faults`.
     """
-    # the pose
+    # the pose: 16 numbers, or none
     value = answer.get("T_world_cam")
     fitting = (AttributeError, TypeError, ValueError, OverflowError)
     with translate_errors(

@@ -52,10 +52,9 @@ class UnfilteredSystemSettings(Settings):
     """Settings of every system on this project's back end."""
 
     filters: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """The rules in the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
-    settings that the class takes, its own first. A rule is left out where the settings lack one of
-    its groups, or where
-    its own group has ``enabled = false``."""
+    """One tuple a filter, in the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups
+    of the settings that the class takes, its own first. A filter is left out where the settings lack one of its
+    groups, or where its own group has ``enabled = false``."""
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
     backend: BackendSettings = BackendSettings()
@@ -99,14 +98,15 @@ class MonocularSemanticSettings(SemanticSystemSettings):
 # Parts that only some systems have. They are loaded by name, so that no other system depends on their
 # code.
 MASK_STAGE = "dynslam_bench.trackers.systems.mask_stage:build_mask_stage"
-"""Builds the segmentation stage."""
+"""Builds the segmentation stage:
+``(settings.segmentation, context, filters, cache) -> (MaskScheduler | None, CachedStage | None)``."""
 FLOW = "dynslam_bench.flow.registry:build_flow"
-"""Builds the optical flow."""
+"""Builds the optical flow: ``(settings.flow, *, device, threads) -> FlowEstimator``."""
 REFINE_PREDICTION = "dynslam_bench.culling.ego_motion:refine_prediction"
-"""Refines the predicted pose by the flow."""
+"""Refines the predicted pose by the flow: ``(FrameBundle, FilterState) -> T_world_cam | None``."""
 
 
-def parts_of(settings: UnfilteredSystemSettings) -> list[str]:
+def component_entry_points(settings: UnfilteredSystemSettings) -> list[str]:
     """The entry points of the parts that a system has beside the back end: filters in force, masks, flow.
 
     Args:
@@ -121,7 +121,7 @@ def parts_of(settings: UnfilteredSystemSettings) -> list[str]:
 
 
 def _filters_in_force(settings: UnfilteredSystemSettings) -> list[tuple[str, list[Any]]]:
-    """The rules of a system that are not left out: ``module:Class``, and the groups of settings that it takes."""
+    """The filters of a system that are not left out: ``module:Class``, and the groups of settings that it takes."""
     in_force: list[tuple[str, list[Any]]] = []
     for name, *groups in settings.filters:
         arguments = [getattr(settings, group, None) for group in groups]
@@ -148,7 +148,7 @@ def compose(
     filters: Sequence[DynamicFilter] = (),
     flow: "FlowMethodSettings | None" = None,
 ) -> Tracker:
-    """The pipeline of a system.
+    """Build the pipeline of a system: back end, extractor, segmentation, filters and flow.
 
     Args:
         settings: Its settings; a `SemanticSystemSettings` brings a segmentation stage.
@@ -197,7 +197,7 @@ def compose(
 
     return SlamPipeline(
         extractor=extractor,
-        masks=masks,
+        mask_scheduler=masks,
         filters=filters,
         flow=estimate_flow,
         refine_prediction=refine_prediction,
@@ -213,7 +213,11 @@ def _check_masks_not_needed(
     settings: UnfilteredSystemSettings, filters: Sequence[DynamicFilter]
 ) -> None:
     """Raise `SegmentationError` where a filter needs masks of a system that has none."""
-    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
+    needing = [
+        dynamic_filter.name
+        for dynamic_filter in filters
+        if {"masks", "boxes"} & dynamic_filter.needs
+    ]
     if not needing:
         return
     fault = "segmentation.source is 'none'"
@@ -239,7 +243,7 @@ UNMATCHED: dict[Unmatched, str] = {
 """Treatment of features without a match, by the setting `unmatched`."""
 
 
-def system(
+def system_spec(
     name: str,
     label: str,
     filters: Sequence[tuple[str, ...]],
@@ -251,21 +255,23 @@ def system(
     entry_point: str = f"{__name__}:build",
     **spec: Any,
 ) -> TrackerSpec:
-    """The spec of a system that is composed of rules.
+    """The spec of a system that is composed of filters.
 
     Args:
         name: Its id.
         label: Its name in tables.
-        filters: Its rules, see `UnfilteredSystemSettings.filters`.
+        filters: One tuple a filter, in order: ``("module:Class", group, ...)``, see
+            `UnfilteredSystemSettings.filters`.
         groups: Groups of its settings, with their defaults, that `base` lacks or has with other
             defaults.
         base: Settings of the kind of system that it is.
         assumptions: Where it deviates from its source, or the source is silent; `sentences` fills
             in ``{masks}``, ...
-        entry_point: Its factory, where it is none of the rules alone.
+        entry_point: Factory ``module:function``; `build` where the system is its filters on the
+            shared back end and nothing else.
         **spec: Further fields of `TrackerSpec`.
     """
-    # the class of its settings; pickle looks it up in this module
+    # make this system's settings class; pickle looks it up among this module's globals
     title = "".join(word.capitalize() for word in re.findall(r"\w+", name))
     fields: dict[str, Any] = {group: (type(default), default) for group, default in groups.items()}
     made = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)

@@ -24,19 +24,19 @@ from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     SemanticSystemSettings,
     SystemSettings,
-    system,
+    system_spec,
 )
 from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
 
 Groups = Mapping[str, Settings]
 """Groups of settings, by name."""
 
-TESTS = (
+FILTERS = (
     ("epipolar:EpipolarFilter", "epipolar"),
-    ("ego_motion:RigidMotionFilter", "motion"),
+    ("rigid_motion:RigidMotionFilter", "motion"),
     ("free_space:FreeSpaceFilter", "free_space"),
 )
-"""The rules of all systems here, in the order of application; each needs its group of settings."""
+"""The filters of all systems here, in the order of application; each needs its group of settings."""
 EPIPOLAR: Groups = {"flow": FlowSettings(), "epipolar": EpipolarSettings()}
 """The sparse flow and the guarded epipolar test."""
 OWN: Groups = {**EPIPOLAR, "motion": RigidMotionSettings(), "free_space": FreeSpaceSettings()}
@@ -47,70 +47,77 @@ PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
 """The paper's flow, dense and with all terms, and its test on every frame, without the guard."""
 
 
+# What is assumed where the paper is silent, and what is this project's own: sentences for the specs.
+
+_SOURCES = (
+    "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
+    "ours are the flow at the points alone without aggregated costs, the conditions under "
+    "which the epipolar test may cull, and the tests of motion and free space in depth"
+)
+_THRESHOLD = "epipolar threshold 1 px and RANSAC (not stated in the paper)"
+_RGBD = "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"
+_SPARSE_FLOW = (
+    "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
+    "no Eq. 2 and 3 (ours)"
+)
+_DENSE_WEIGHTS = (
+    "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
+    "7 and 2 grey levels"
+)
+_DENSE_FLOW = (
+    "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
+    "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
+    "smoothing by regions are ours)"
+)
+_GUARD = "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
+_NEIGHBOURS = "a failing point goes only where its neighbours fail too (ours)"
+_NEIGHBOURS_AND_DEPTH = (
+    "a failing point goes only where its neighbours fail too, and an F that depth "
+    "contradicts is not used (ours)"
+)
+_DEPTH_TESTS = (
+    "rigid motion in depth and free space seen before are tested as well "
+    "(ours, no part of the paper)"
+)
+
+
 def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
     """Sentences on what is assumed or ours in a system, as its settings make them true."""
-    masks = base is not SystemSettings
-    monocular = base is MonocularSemanticSettings
-    tested = "epipolar" in groups
-    paper = name.startswith("emfoa-oft-paper")
-    sparse = isinstance(groups.get("flow"), FlowSettings)
-    guarded = tested and not paper
+    has_masks = base is not SystemSettings
+    is_monocular = base is MonocularSemanticSettings
+    is_tested = "epipolar" in groups
+    is_paper = name.startswith("emfoa-oft-paper")
+    is_sparse = isinstance(groups.get("flow"), FlowSettings)
     sentences: list[str] = []
     if name == "emfoa-oft":
-        sentences.append(
-            "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
-            "ours are the flow at the points alone without aggregated costs, the conditions under "
-            "which the epipolar test may cull, and the tests of motion and free space in depth"
-        )
+        sentences.append(_SOURCES)
 
-    # masks
-    if masks:
-        sentences.append("{masks}")
-        sentences.append(CFPN)
-    if masks and "segmentation" not in groups:
+    # masks; `composition.sentences` has the texts in braces
+    if has_masks:
+        sentences += ["{masks}", CFPN]
+    if has_masks and "segmentation" not in groups:
         sentences.append("{dilation}")
 
-    if tested:
-        sentences.append("epipolar threshold 1 px and RANSAC (not stated in the paper)")
-    if not monocular:
-        sentences.append("RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)")
+    # the epipolar test and the back end
+    if is_tested:
+        sentences.append(_THRESHOLD)
+    if not is_monocular:
+        sentences.append(_RGBD)
 
     # flow
-    if sparse:
-        sentences.append(
-            "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
-            "no Eq. 2 and 3 (ours)"
-        )
-    if paper and not sparse:
-        sentences.append(
-            "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
-            "7 and 2 grey levels"
-        )
-        sentences.append(
-            "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
-            "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
-            "smoothing by regions are ours)"
-        )
+    if is_sparse:
+        sentences.append(_SPARSE_FLOW)
+    if is_paper and not is_sparse:
+        sentences += [_DENSE_WEIGHTS, _DENSE_FLOW]
 
-    # the guard of the epipolar test, and tests beside it
-    if guarded:
-        sentences.append(
-            "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
-        )
-    if guarded and monocular:
-        sentences.append("a failing point goes only where its neighbours fail too (ours)")
-    if guarded and not monocular:
-        sentences.append(
-            "a failing point goes only where its neighbours fail too, and an F that depth "
-            "contradicts is not used (ours)"
-        )
+    # the guard of the epipolar test, which the paper's variants lack, and the tests beside it
+    if is_tested and not is_paper:
+        sentences.append(_GUARD)
+        sentences.append(_NEIGHBOURS if is_monocular else _NEIGHBOURS_AND_DEPTH)
     if "motion" in groups:
-        sentences.append(
-            "rigid motion in depth and free space seen before are tested as well "
-            "(ours, no part of the paper)"
-        )
+        sentences.append(_DEPTH_TESTS)
 
-    if monocular:
+    if is_monocular:
         sentences.append(BACKEND)
     return sentences
 
@@ -119,8 +126,8 @@ def _spec(
     name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any
 ) -> TrackerSpec:
     """The spec of one of these systems; `more` are further fields of `TrackerSpec`."""
-    filters = TESTS if "masks=vote" in name else (SEMANTIC, *TESTS)
-    return system(
+    filters = FILTERS if "masks=vote" in name else (SEMANTIC, *FILTERS)
+    return system_spec(
         name,
         label,
         filters,

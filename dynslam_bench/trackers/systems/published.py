@@ -1,6 +1,6 @@
 """Published systems, and the two references beside them, as compositions of filters on the shared back end: a table.
 
-An entry names the rules of a system with their settings, and every deviation from its source.
+An entry names the filters of a system with their settings, and every deviation from its source.
 """
 
 from typing import Any
@@ -37,7 +37,7 @@ from dynslam_bench.trackers.systems.composition import (
     UnfilteredSystemSettings,
     UnrepairedSettings,
     compose,
-    system,
+    system_spec,
 )
 
 # Rules and the groups of settings that they take, see `UnfilteredSystemSettings.filters`.
@@ -70,8 +70,8 @@ def build_detect_slam(settings: SemanticSystemSettings, context: TrackerContext)
     """Detect-SLAM: boxes on keyframes, in place of masks, feed the moving probability."""
     from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
-    rule = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
-    return compose(settings, context, [rule], settings.flow)  # type: ignore[attr-defined]
+    boxes_filter = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
+    return compose(settings, context, [boxes_filter], settings.flow)  # type: ignore[attr-defined]
 
 
 ORB_SLAM2 = (
@@ -122,7 +122,7 @@ SPECS = (
     # The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), with depth
     # and without: no dynamic handling beyond the robust kernel and the chi-square tests of the pose
     # optimiser.
-    system(
+    system_spec(
         "orb-slam2",
         "ORB-SLAM2 style (our back end)",
         (),
@@ -139,7 +139,7 @@ SPECS = (
         ),
         remarks=ORB_SLAM2_REMARKS,
     ),
-    system(
+    system_spec(
         "orb-slam2-mono",
         "ORB-SLAM2 style, monocular (our back end)",
         (),
@@ -156,7 +156,7 @@ SPECS = (
         remarks=ORB_SLAM2_REMARKS,
     ),
     # Masks of people as the only filter; `dynaslam-n` is the published system with the same rule.
-    system(
+    system_spec(
         "mask-rcnn",
         "Mask R-CNN culling (our back end)",
         (SEMANTIC,),
@@ -175,7 +175,7 @@ SPECS = (
     ),
     # Blitz-SLAM (Fan et al. 2022): masks repaired by depth, then a strict epipolar test inside the
     # boxes.
-    system(
+    system_spec(
         "blitz-slam",
         "Blitz-SLAM (our back end)",
         (
@@ -204,7 +204,7 @@ SPECS = (
         ),
     ),
     # CFP-SLAM (Hu et al. 2022): a static probability weighs each point instead of dropping it.
-    system(
+    system_spec(
         "cfp-slam",
         "CFP-SLAM (our back end)",
         (PROBABILITY,),
@@ -232,7 +232,7 @@ SPECS = (
     # Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar
     # culling. Theirs is monocular: chen-slam is the same with depth, to stand beside the other
     # systems.
-    system(
+    system_spec(
         "chen-slam",
         "Chen et al. 2022 (our back end)",
         (SEMANTIC, BOX_EPIPOLAR),
@@ -241,7 +241,7 @@ SPECS = (
         **CHEN,
         assumptions=(*CHEN_ASSUMPTIONS, "RGB-D back end (theirs is monocular: chen-slam-mono)"),
     ),
-    system(
+    system_spec(
         "chen-slam-mono",
         "Chen et al. 2022, monocular (our back end)",
         (SEMANTIC, BOX_EPIPOLAR),
@@ -253,7 +253,7 @@ SPECS = (
         assumptions=(*CHEN_ASSUMPTIONS, BACKEND),
     ),
     # Dai et al. (TPAMI 2020): point correlations on a Delaunay graph, no semantics.
-    system(
+    system_spec(
         "dai-slam",
         "Dai et al. (our back end)",
         (("correlation_graph:CorrelationFilter", "correlation"),),
@@ -281,7 +281,7 @@ SPECS = (
     ),
     # Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on
     # keyframes.
-    system(
+    system_spec(
         "detect-slam",
         "Detect-SLAM (our back end)",
         (),
@@ -307,7 +307,7 @@ SPECS = (
         ),
     ),
     # DGS-SLAM (Yan et al. 2022): clusters of high residual move, people more readily.
-    system(
+    system_spec(
         "dgs-slam",
         "DGS-SLAM (Yan 2022) (our back end)",
         (("residual_clusters:ResidualFilter", "residual", "segmentation"),),
@@ -329,7 +329,7 @@ SPECS = (
         remarks="not the Gaussian-splatting DGS-SLAM of Kong et al. 2024",
     ),
     # DI-SLAM (Wei et al. 2025): boxes, epipolar test, multi-view geometry.
-    system(
+    system_spec(
         "di-slam",
         "DI-SLAM (our back end)",
         (
@@ -365,7 +365,7 @@ SPECS = (
         ),
     ),
     # DS-SLAM (Yu et al. 2018): if a moving corner lies near a person, the people go.
-    system(
+    system_spec(
         "ds-slam",
         "DS-SLAM (our back end)",
         (("epipolar:MovingVoteFilter", "moving_vote", "segmentation"),),
@@ -384,7 +384,7 @@ SPECS = (
     ),
     # DynaSLAM (Bescos et al. 2018): masks of a-priori dynamic classes, multi-view geometry, or
     # both.
-    system(
+    system_spec(
         "dynaslam",
         "DynaSLAM N+G (our back end)",
         (SEMANTIC, MULTIVIEW),
@@ -398,7 +398,7 @@ SPECS = (
         assumptions=(*DYNASLAM_MASKS, *DYNASLAM_GEOMETRY, *DYNASLAM_PAPER, DYNASLAM_UNION),
         remarks=NO_INPAINTING,
     ),
-    system(
+    system_spec(
         "dynaslam-code",
         "DynaSLAM N+G (code's constants) (our back end)",
         (SEMANTIC, MULTIVIEW),
@@ -417,7 +417,7 @@ SPECS = (
         assumptions=(*DYNASLAM_MASKS, *DYNASLAM_GEOMETRY, DYNASLAM_UNION),
         remarks=NO_INPAINTING,
     ),
-    system(
+    system_spec(
         "dynaslam-n",
         "DynaSLAM N (our back end)",
         (SEMANTIC, MULTIVIEW),
@@ -431,7 +431,7 @@ SPECS = (
         assumptions=DYNASLAM_MASKS,
         remarks=NO_INPAINTING,
     ),
-    system(
+    system_spec(
         "dynaslam-g",
         "DynaSLAM G (our back end)",
         (SEMANTIC, MULTIVIEW),
@@ -451,7 +451,7 @@ SPECS = (
         ),
     ),
     # DynaTM-SLAM (Zhong et al. 2024): template matching over a window inside boxes.
-    system(
+    system_spec(
         "dynatm-slam",
         "DynaTM-SLAM (our back end)",
         (("template_matching:TemplateFilter", "template", "segmentation"),),
@@ -471,7 +471,7 @@ SPECS = (
     ),
     # Huai et al. (Sensors 2025): missed masks bridged, split by depth, moving probability of
     # keypoints.
-    system(
+    system_spec(
         "huai-slam",
         "Huai et al. 2025 (our back end)",
         (PROBABILITY,),
@@ -496,7 +496,7 @@ SPECS = (
         ),
     ),
     # MOR-SLAM (Yao et al. 2023): repaired masks, F from outside them, epipolar test.
-    system(
+    system_spec(
         "mor-slam",
         "MOR-SLAM (our back end)",
         (
@@ -521,7 +521,7 @@ SPECS = (
         ),
     ),
     # NGD-SLAM (Zhang et al. 2024): boxes cut out by depth, propagated between detections.
-    system(
+    system_spec(
         "ngd-slam",
         "NGD-SLAM (our back end)",
         (
@@ -550,7 +550,7 @@ SPECS = (
         ),
     ),
     # OPF-SLAM: named in the paper without a citation; nobody knows what it is.
-    system(
+    system_spec(
         "opf-slam",
         "OPF-SLAM (our back end)",
         (("epipolar:EpipolarFilter", "epipolar"),),
@@ -566,7 +566,7 @@ SPECS = (
         remarks="perhaps OFM-SLAM or the optical-flow system of Chen et al. 2022 is meant",
     ),
     # SEG-SLAM (Cong et al. 2024): three rules: class, depth, epipolar line.
-    system(
+    system_spec(
         "seg-slam",
         "SEG-SLAM (our back end)",
         (CLASS_RULE,),
@@ -584,7 +584,7 @@ SPECS = (
         ),
     ),
     # SGC-VSLAM (Yang et al. 2020): F from the points outside the boxes, the test for all.
-    system(
+    system_spec(
         "sgc-slam",
         "SGC-VSLAM (our back end)",
         (BOX_EPIPOLAR,),
@@ -608,7 +608,7 @@ SPECS = (
     ),
     # SOF-SLAM (Cui and Ma 2019): F from static-labelled points, tested on movable things; people
     # go.
-    system(
+    system_spec(
         "sof-slam",
         "SOF-SLAM (our back end)",
         (CLASS_RULE,),
@@ -630,7 +630,7 @@ SPECS = (
         ),
     ),
     # YOLO-SLAM (Wu et al. 2022): depth RANSAC among the features of a person's box.
-    system(
+    system_spec(
         "yolo-slam",
         "YOLO-SLAM (our back end)",
         (("depth_regions:DepthRansacFilter", "depth_ransac", "segmentation"),),

@@ -55,7 +55,6 @@ function startBoard() {
     ticks();
   });
   byId("sure").onclick = () => { sure = !sure; address.write({ sure: sure ? "1" : "" }); tables.forEach(showSure); };
-  select("[data-copy]").forEach((button) => { button.onclick = () => navigator.clipboard.writeText(button.nextElementSibling.textContent).then(() => { button.textContent = "Copied"; }); });
   byId("compare").onclick = () => { const [a, b] = selected; location.href = `compare.html#a=${a}&b=${b}`; };
   byId("copy-link").onclick = ({ target }) => navigator.clipboard.writeText(location.href).then(() => { target.textContent = "Link copied"; });
   showTab(view.get("tab"));

@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 import pytest
 from helpers.envs_play import play
-from helpers.hostile import alive, until
+from helpers.hostile import alive
+from helpers.waiting import until
 from test_adapter_controls import PACKED, XYZ, needs_data
 
 from dynslam_bench import api as db

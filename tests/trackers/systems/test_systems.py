@@ -97,8 +97,8 @@ def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) 
 
     for name, wanted in (("seg-slam", ("person", "chair")), ("mask-rcnn", ("person",))):
         tracker = build(TRACKERS.get(name), walking)
-        tracker._masks.segmenter.inner = Network()
-        assert tracker._masks.segmenter.segment(walking[0]).class_names == wanted
+        tracker._mask_scheduler.segmenter.inner = Network()
+        assert tracker._mask_scheduler.segmenter.segment(walking[0]).class_names == wanted
 
 
 @pytest.mark.parametrize("spec", all_specs(), ids=lambda spec: spec.id)
