@@ -119,8 +119,13 @@ SESSION_VARIABLES = (
     "TERM_SESSION_ID",
     "VSCODE_IPC_HOOK_CLI",
     "PYTEST_CURRENT_TEST",
+    "DYNSLAM_BENCH_PLUGINS",
+    "DYNSLAM_BENCH_START",
 )
-"""These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
+"""These name the terminal, the login or the moment, or say how this package finds plug-ins and starts runs.
+
+Programs do not get them, and their values do not count: a run gets the list of its own plug-ins
+alone, whose code counts."""
 DECLARED_VARIABLE = "dynslam_bench.declared_variable"
 """Announced (`sys.audit`) of each variable, its argument, that a program's settings declare, set or not."""
 _UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))

@@ -15,12 +15,9 @@ from dynslam_bench.geometry import (
     median_step,
     se3,
 )
+from dynslam_bench.geometry.speeds import impossible_motion
 from dynslam_bench.geometry.stamp_units import SLOWEST_S
 
-FASTEST_M_S = 100.0
-"""No camera goes faster than this from one pose to the next, if it goes as far as `LONGEST_STEP_M`."""
-LONGEST_STEP_M = 1.0
-"""Shorter steps are not doubted, however fast."""
 LONGEST_HOLE_S = 86_400.0
 """A day: no recording has such a hole."""
 FEWEST_PAIRS = 8
@@ -75,22 +72,8 @@ def _of_stamps(trajectory: Trajectory, whose: str) -> list[str]:
 
 def _of_motion(trajectory: Trajectory, whose: str) -> list[str]:
     """Poses that no camera reaches from one to the next."""
-    seconds = np.diff(trajectory.timestamps)
-    steps_m = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)[seconds > 0]
-    speeds = steps_m / seconds[seconds > 0]
-    fast = (speeds > FASTEST_M_S) & (steps_m > LONGEST_STEP_M)
-    if not fast.any():
-        return []
-    if 2 * fast.sum() > len(fast):
-        fault = f"the {whose} moves at {np.median(speeds):.3g} m/s by the median"
-        return [f"far-positions: {fault}: are its positions in millimetres? Give metres"]
-    distances_m = np.linalg.norm(
-        trajectory.positions - np.median(trajectory.positions, axis=0), axis=1
-    )
-    farthest = int(distances_m.argmax())
-    fault = f"{fast.sum()} of {len(fast)} steps of the {whose} are faster than {FASTEST_M_S:g} m/s"
-    where = f"the pose at the stamp {trajectory.timestamps[farthest]:.6f} lies {distances_m[farthest]:.3g} m"
-    return [f"far-positions: {fault}: {where} from the middle of the path, correct or remove it"]
+    motion = impossible_motion(trajectory, whose)
+    return [] if motion is None else [f"far-positions: {motion}"]
 
 
 def _of_pairs(comparison: Comparison) -> list[str]:

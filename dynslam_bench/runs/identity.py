@@ -45,12 +45,12 @@ from dynslam_bench.runs.own_code import (
     modules_by_component,
     portable_name,
 )
-from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, digest_of_request, run_id_of
+from dynslam_bench.runs.record import ASKED_DIGITS, IDENTITY_SCHEME, StartMap, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import PreprocessingSettings
-from dynslam_bench.sequences.view import SequencePart, sequence_part_of
+from dynslam_bench.sequences.view import SequencePart, reader_of, sequence_part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
@@ -98,7 +98,7 @@ class ResolvedRun:
     @cached_property
     def request_digest(self) -> str:
         """The first twelve digits of its id: what is asked for."""
-        return digest_of_request(self.identity)
+        return self.run_id[:ASKED_DIGITS]
 
     @cached_property
     def run_id(self) -> str:
@@ -170,6 +170,7 @@ class Resolver:
         self._libraries = lru_cache(maxsize=None)(libraries)
         self._configurations: dict[str, _Configuration] = {}
         self._files: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
+        self._components: dict[tuple[str, str, str, bool], tuple[list[str], BaseFolders]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up everything that decides a run's result, and name it by digests.
@@ -189,7 +190,10 @@ class Resolver:
         settings = configured.settings
 
         # open the sequence, cut to the frames asked for; refuse what the tracker cannot use
-        where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
+        preprocessing = preprocessing_of(settings)
+        if preprocessing is not None and not preprocessing.changes_images:
+            preprocessing = None  # trackers with and without such settings share the frames
+        where = (spec.sequence, spec.data_root, spec.camera, preprocessing)
         sequence, part = self._opened_part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
         check_degradation(spec.degrade)
@@ -202,11 +206,9 @@ class Resolver:
 
         asked = _asked(spec, configured, part, device, start_map)
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
-        entry_points = components_of_run(
-            tracker, settings, source, sequence, changes_frames=changes_frames
+        parts, base_folders = self._named_components(
+            configured, source, sequence, changes_frames=changes_frames
         )
-        base_folders = base_folders_of(tracker, entry_points)
-        parts = sorted(portable_name(entry, base_folders) for entry in entry_points)
 
         # what it will read, as far as that is known beforehand
         read = {
@@ -251,6 +253,29 @@ class Resolver:
         if key not in self._files:
             self._files[key] = _files_of(configured.tracker, configured.settings, source)
         return self._files[key]
+
+    def _named_components(
+        self, configured: _Configuration, source: str, sequence: Sequence, *, changes_frames: bool
+    ) -> tuple[list[str], BaseFolders]:
+        """What a run is made of, by the names of its identity, and where the names of files begin.
+
+        Looked up once for a tracker with its settings, a source of masks and a kind of sequence;
+        see `components_of_run`.
+        """
+        reader = reader_of(sequence)
+        key = (configured.key, source, reader, changes_frames)
+        if key not in self._components:
+            entry_points = components_of_run(
+                configured.tracker,
+                configured.settings,
+                source,
+                reader,
+                changes_frames=changes_frames,
+            )
+            base_folders = base_folders_of(configured.tracker, entry_points)
+            parts = sorted(portable_name(entry, base_folders) for entry in entry_points)
+            self._components[key] = (parts, base_folders)
+        return self._components[key]
 
     def _open_part(
         self,

@@ -100,6 +100,6 @@ def have_equal_files(one: Path, other: Path, *names: str) -> bool:
     return all(content_of(one / name) == content_of(other / name) for name in names)
 
 
-def read_errors(file: Path) -> contextlib.AbstractContextManager[None]:
+def read_errors(file: str | Path) -> contextlib.AbstractContextManager[None]:
     """Turns errors of the system while a file of a store is read into a `RunError`."""
     return translate_errors(RunError, f"cannot read {file}", REMOVED_HINT)

@@ -1,8 +1,11 @@
 """Finds the stored run of a request: the one of which all that was read is unchanged."""
 
+from collections import defaultdict
+from functools import cached_property
+
 from dynslam_bench.core.reads import Verifier
 from dynslam_bench.runs.identity import ResolvedRun
-from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.record import ASKED_DIGITS, RunRecord
 from dynslam_bench.runs.store import RunStore
 
 
@@ -14,7 +17,7 @@ class LookUp:
     the one is taken whose files, environment variables and packages are unchanged.
 
     Args:
-        store: Where the runs lie.
+        store: Where the runs lie. Those that are stored later are not found.
     """
 
     def __init__(self, store: RunStore) -> None:
@@ -27,7 +30,7 @@ class LookUp:
         Of several the newest is taken: a file may have been changed and put back.
         """
         # a run of built-in parts is found by its id alone
-        if not run.has_plugins_or_programs:
+        if not run.has_plugins_or_programs and run.run_id in self._stored_ids[run.request_digest]:
             record = self._store.get(run.run_id)
             if record is not None and record.identity == run.stated:
                 return record
@@ -51,8 +54,16 @@ class LookUp:
 
     def _candidates(self, run: ResolvedRun) -> list[RunRecord]:
         """The stored runs of a request, whatever they have read."""
-        records = map(self._store.get, self._store.ids_of(run.request_digest))
+        records = map(self._store.get, self._stored_ids[run.request_digest])
         return [record for record in records if record is not None]
+
+    @cached_property
+    def _stored_ids(self) -> defaultdict[str, list[str]]:
+        """The ids of the stored runs by their first digits: one listing serves many requests."""
+        by_request: defaultdict[str, list[str]] = defaultdict(list)
+        for run_id in self._store.ids():
+            by_request[run_id[:ASKED_DIGITS]].append(run_id)
+        return by_request
 
     def _is_current(self, record: RunRecord, run: ResolvedRun) -> bool:
         """Whether a stored run is what is asked for, and nothing that it read has changed."""

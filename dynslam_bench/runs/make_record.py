@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
+from dynslam_bench.contracts import Sequence
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
 from dynslam_bench.core.reads import Reads
 from dynslam_bench.core.records import digest
@@ -14,6 +15,7 @@ from dynslam_bench.runs.identity import ResolvedRun
 from dynslam_bench.runs.process.supervisor import ProcessEnd
 from dynslam_bench.runs.record import (
     LOST_COVERAGE,
+    ON_RECORDING,
     RunRecord,
     SequenceInfo,
     StageTime,
@@ -263,7 +265,12 @@ def _notes(run: ResolvedRun) -> list[str]:
         notes.append(_BATCH_NOTE)
     if run.start_map is not None:
         notes.append(run.start_map.describe())
-    return notes
+    return [*notes, *recording_notes(run.sequence)]
+
+
+def recording_notes(sequence: Sequence) -> list[str]:
+    """What of a recording was not used, or what nobody could mean, a line each; see `RecordedSequence.remarks`."""
+    return [f"{ON_RECORDING}{remark}" for remark in getattr(sequence, "remarks", ())]
 
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:

@@ -408,8 +408,10 @@ def requested_files(spec: RunSpec) -> list[str]:
 
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
     """Whether a stored run has to be made again for a video, a sheet, a recording or a map that is asked for now."""
-    folder = store.folder(stored.run_id)
     wanted = requested_files(run.spec)
+    if not wanted:
+        return False
+    folder = store.folder(stored.run_id)
     # a note says why the run could not give a file
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
     # what ends early has no map to draw, and what saw no frame nothing at all

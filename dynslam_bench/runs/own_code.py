@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.contracts import Sequence, TrackerSpec
+from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
 from dynslam_bench.core.plugins import Registry
 from dynslam_bench.core.plugins import used as used_plugins
@@ -21,7 +21,6 @@ from dynslam_bench.flow.registry import FLOWS, spec_of
 from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS
-from dynslam_bench.sequences.view import reader_of
 from dynslam_bench.trackers.registry import TRACKERS
 from dynslam_bench.trackers.systems.composition import (
     UnfilteredSystemSettings,
@@ -73,7 +72,7 @@ def components_of_run(
     tracker: TrackerSpec,
     settings: Settings,
     source: str,
-    sequence: Sequence,
+    reader: str,
     *,
     changes_frames: bool,
 ) -> list[str]:
@@ -85,11 +84,11 @@ def components_of_run(
         tracker: The tracker.
         settings: Its complete settings.
         source: Where its masks come from; empty for a tracker without a semantic stage.
-        sequence: The opened sequence.
+        reader: The module that reads or renders the sequence, see `sequences.view.reader_of`.
         changes_frames: Whether frames are degraded or dropped.
     """
     # the tracker with its filters, features, flow and masks, and the reader of the sequence
-    components = {*entry_points_of(tracker, settings, source), reader_of(sequence)}
+    components = {*entry_points_of(tracker, settings, source), reader}
     if changes_frames:
         components.add(f"{PACKAGE}.{DEGRADED_FRAMES}")
     return sorted(components)

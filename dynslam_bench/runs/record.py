@@ -18,6 +18,9 @@ RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 """Version of the fields of `MetricRecord`."""
 
+ON_RECORDING = "recording: "
+"""Begins a run's notes on what of its recording was not used, or what nobody could mean."""
+
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
 """How a run ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
@@ -49,9 +52,13 @@ LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
 
 
+ASKED_DIGITS = 12
+"""So many digits of a run's id tell what was asked for."""
+
+
 def digest_of_request(identity: Mapping[str, Any]) -> str:
     """The first twelve digits of a run's id: what was asked for."""
-    return digest({name: identity[name] for name in ASKED if name in identity}, 12)
+    return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
 
 def run_id_of(identity: Mapping[str, Any]) -> str:
@@ -236,7 +243,8 @@ class RunRecord(Record):
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported
             trajectories.
         study: Study that made it, if it was not asked for without the study; else empty.
-        notes: Anything a reader should know, one line each.
+        notes: Anything a reader should know, one line each; those on the recording begin with
+            `ON_RECORDING`.
         files: SHA-256 of the trajectories, the stamps and the ground truth, by the file's name.
     """
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from dynslam_bench.core import assignments
-from dynslam_bench.runs.record import MetricRecord, RunRecord
+from dynslam_bench.runs.record import ON_RECORDING, MetricRecord, RunRecord
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,9 +77,15 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "study": record.trial_of,
         "identity": "" if record.verified else "unverified",
         "reason": _reason(record, metrics),
-        "remarks": [] if scored is None else scored.remarks,
+        "remarks": _remarks(record, scored),
         "started": record.started,
     }
+
+
+def _remarks(record: RunRecord, metrics: MetricRecord | None) -> list[str]:
+    """What to know before the numbers are believed: of the recording, then of the errors."""
+    of_recording = [f"warning: {note}" for note in record.notes if note.startswith(ON_RECORDING)]
+    return [*of_recording, *([] if metrics is None else metrics.remarks)]
 
 
 def _coverage(record: RunRecord, metrics: MetricRecord | None) -> float | None:

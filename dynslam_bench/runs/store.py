@@ -68,6 +68,11 @@ LOGGER = logging.getLogger(__name__)
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
 
 
+def _sha256_of(path: str) -> str:
+    """SHA-256 of a file; see `file_sha256`."""
+    return file_sha256(Path(path))
+
+
 class RunStore:
     """Runs and the sequences' ground truth below one folder.
 
@@ -192,12 +197,14 @@ class RunStore:
         """
         sequence = self.sequences.folder(part)
         checksums = {}
-        for path in (run / ONLINE, run / FINAL, sequence / TRUTH, sequence / STAMPS):
-            if not path.is_file():
-                continue
-            with read_errors(path):
-                # many runs share the files of a sequence: each is read once a process
-                checksums[path.name] = remembered("sha256", str(path), partial(file_sha256, path))
+        for folder, names in ((run, (ONLINE, FINAL)), (sequence, (TRUTH, STAMPS))):
+            for name in names:
+                path = f"{folder}/{name}"
+                if not os.path.isfile(path):  # noqa: PTH113 - of thousands of runs, as `file_stamp`
+                    continue
+                with read_errors(path):
+                    # many runs share the files of a sequence: each is read once a process
+                    checksums[name] = remembered("sha256", path, partial(_sha256_of, path))
         return checksums
 
     def changed(self, record: RunRecord) -> str:
@@ -329,10 +336,6 @@ class RunStore:
                 )
         except (FileNotFoundError, NotADirectoryError):
             return []
-
-    def ids_of(self, request_digest: str) -> list[str]:
-        """Ids of the stored runs of one request, by its first twelve digits; see `record.digest_of_request`."""
-        return [run_id for run_id in self.ids() if run_id.startswith(request_digest)]
 
     def read(self, run_id: str) -> RunRecord:
         """The record of a run by its id, the id's first digits, or ``latest``.

@@ -14,7 +14,7 @@ from dynslam_bench.geometry import Array, Camera, se3
 from dynslam_bench.sequences.camera_fit import GROUPS, Fit, fit_camera
 from dynslam_bench.sequences.depth_scale import DepthScale, depth_scale
 from dynslam_bench.sequences.findings import Finding, finding_of
-from dynslam_bench.sequences.image_checks import USUAL_FACTORS
+from dynslam_bench.sequences.readers.recorded import USUAL_FACTORS
 from dynslam_bench.sequences.rgbd_motion import (
     ROTATION_NOISE,
     Match,

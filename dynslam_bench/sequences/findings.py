@@ -139,6 +139,7 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "the truth moves the image by {value:.0f} pixels between frames that move by {displacement:.1f}",
         "take the truth of this recording",
     ),
+    "truth-far": ("", "{text}", "correct that line of groundtruth.txt, or remove it"),
     "truth-sparse": (
         "frames",
         "{value:.0f} of {frames} frames have a true pose within {within} s",

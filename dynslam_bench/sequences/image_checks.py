@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame
 from dynslam_bench.sequences.findings import Finding, finding_of
+from dynslam_bench.sequences.readers.recorded import DEPTH_RANGE_M, likely_factor
 
 Map = NDArray[np.float32]
 
@@ -35,10 +36,6 @@ LEAST_DELAY = 2
 """In frames; the first Kinect's depth lags by nearly one."""
 CLEAR_PEAK = 7.0
 """Height of a clear correlation peak, in standard deviations over all shifts: unrelated maps stay below 6."""
-DEPTH_RANGE_M = (0.1, 60.0)
-"""Median depths outside of this range are in another unit than metres."""
-USUAL_FACTORS = (1.0, 100.0, 1000.0, 5000.0)
-"""Raw units a metre of public data: metres, centimetres, millimetres, TUM's."""
 _PEAK_REACH = 30
 """Cells from no shift within which a correlation's peak is looked for."""
 
@@ -298,8 +295,7 @@ def _check_units(statistics: ImageStatistics) -> Finding | None:
     factor = statistics.depth_factor
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
-    # the first usual factor that gives a median depth of 0.4 to 8 m.
-    likely = next((usual for usual in USUAL_FACTORS if 0.4 < median * factor / usual < 8), factor)
+    likely = likely_factor(median * factor) or factor
     return finding_of("depth-units", median, factor=factor, likely=likely)
 
 

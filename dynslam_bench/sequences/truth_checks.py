@@ -15,6 +15,7 @@ import numpy as np
 
 from dynslam_bench.geometry import Array, Camera, Trajectory, nearest_gap
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, Matrix, in_camera_axes, nearest_rotation
+from dynslam_bench.geometry.speeds import impossible_motion
 from dynslam_bench.sequences.camera_checks import (
     GOOD,
     LEAST_PAIRS,
@@ -104,6 +105,11 @@ def truth_findings(
     covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
         return [finding_of("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
+
+    # a pose that no camera reaches; a wrong unit of all of them shows in the comparison
+    motion = impossible_motion(truth, "ground truth")
+    if motion is not None and motion.of_single_poses:
+        return [finding_of("truth-far", None, text=motion.fault)]
 
     # do the images show a motion?
     usable = [

@@ -1,7 +1,7 @@
 """Kills commands at random moments, repeats them, and compares what they give with what they give undisturbed.
 
     python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge
-    bank]
+    bank import gate]
 
 Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels.
 It is done once undisturbed. Then, so many times, it begins again in an empty folder; its process
@@ -9,8 +9,9 @@ group gets SIGKILL when its result has come as far as a random number says, and 
 later; and the same command is given again. A command that ends before its kill is drawn again. The
 table gives the kills in the middle (some of the result was there, and not all), how many commands
 went on, with exit code 0, and how many gave an equal result: statuses, checksums of trajectories
-and errors of runs; trials, candidates and preset of a study; the files of a report, of merged
-results and of a bank. Times of the machine are not compared. The exit code is 1 unless all results
+and errors of runs, imported ones too; trials, candidates and preset of a study; the files of a
+report, of merged results and of a bank; the baseline of a gate. Times of the machine are not
+compared. The exit code is 1 unless all results
 are equal.
 """
 
@@ -37,6 +38,7 @@ import numpy as np
 from command_line import parser_of
 
 from dynslam_bench.core.plugins import module_command
+from dynslam_bench.gate.baseline import BASELINE_FILE
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs import RunStore
 from dynslam_bench.sequences.cameras import write_camera
@@ -79,6 +81,10 @@ SUITE = """
 trackers = ["never-move", {tracker}]
 sequences = {sequences}
 seeds = [0, 1]
+"""
+GATE = """
+trackers = ["{tracker}"]
+sequences = {sequences}
 """
 STUDY = """
 tracker = {tracker}
@@ -171,6 +177,17 @@ def files_of(folder: Path) -> dict[str, bytes | str]:
     return contents
 
 
+def baseline_of(folder: Path) -> list[Any]:
+    """The errors, coverages and checksums of a gate's baseline."""
+    baseline = json.loads((folder / BASELINE_FILE).read_text())
+    rows = []
+    for measurement in baseline["runs"]:
+        del measurement["frame_time_s"]
+        del measurement["memory_mb"]
+        rows.append(measurement)
+    return [baseline["question"], rows]
+
+
 # -- commands
 
 
@@ -181,10 +198,12 @@ class Command:
     Attributes:
         words: Words of the command line; ``{target}`` is the folder that it writes.
         read: Gives its result.
+        within: The folder in which it is given; None for the one that holds the target.
     """
 
     words: list[str]
     read: Callable[[Path], Any]
+    within: Path | None = None
 
     def start(self, target: Path) -> subprocess.Popen[bytes]:
         """Start it in a process group of its own."""
@@ -194,7 +213,7 @@ class Command:
         with log:
             return subprocess.Popen(
                 command,
-                cwd=target.parent,
+                cwd=self.within or target.parent,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -207,7 +226,7 @@ class Command:
 
 
 def make_commands(folder: Path) -> dict[str, Command]:
-    """The five commands, on inputs that are made below a folder."""
+    """The commands, on inputs that are made below a folder."""
     sequences = [str(make_sequence(folder / f"s{number}", 0.5 * number)) for number in range(4)]
     (folder / "drifting.py").write_text(TRACKER)
     tracker = json.dumps(f"{folder / 'drifting.py'}:SPEC")
@@ -223,6 +242,7 @@ def make_commands(folder: Path) -> dict[str, Command]:
         )
     )
     bench = Command(["bench", str(suite), "--results", "{target}"], runs_of)
+    repository = make_repository(folder / "repository", sequences[:2])
     results = folder / "results"
     assert bench.finish(results) == 0, results.with_suffix(".log").read_text()
     shards = [str(shard) for shard in split(results, folder)]
@@ -232,7 +252,34 @@ def make_commands(folder: Path) -> dict[str, Command]:
         "report": Command(["report", str(results), "-o", "{target}"], files_of),
         "merge": Command(["runs", "merge", *shards, "-o", "{target}"], files_of),
         "bank": Command(["bank", "add", *shards, "{target}"], files_of),
+        "import": Command(
+            [
+                *("import", f"{sequences[0]}/groundtruth.txt", "--tracker", "elsewhere"),
+                *("--sequence", sequences[0], "--results", "{target}"),
+            ],
+            runs_of,
+        ),
+        "gate": Command(
+            [
+                *("gate", "record", "--baseline", f"{{target}}/{BASELINE_FILE}"),
+                *("--results", "{target}/gate"),
+            ],
+            baseline_of,
+            within=repository,
+        ),
     }
+
+
+def make_repository(folder: Path, sequences: list[str]) -> Path:
+    """A git repository with a tracker and the question of a gate."""
+    folder.mkdir()
+    (folder / "drifting.py").write_text(TRACKER)
+    question = GATE.format(tracker="drifting.py:SPEC", sequences=json.dumps(sequences))
+    (folder / "gate.toml").write_text(question)
+    author = ["-c", "user.name=Kills", "-c", "user.email=kills@example.org"]
+    for words in (["init", "-q"], ["add", "."], [*author, "commit", "-q", "-m", "Add a tracker"]):
+        subprocess.run(["git", *words], cwd=folder, check=True)
+    return folder
 
 
 def split(results: Path, folder: Path) -> Iterator[Path]:
@@ -361,7 +408,7 @@ def difference(expected: Any, result: Any) -> str:
 
 def main() -> int:
     """Print the table."""
-    names = ["bench", "tune", "report", "merge", "bank"]
+    names = ["bench", "tune", "report", "merge", "bank", "import", "gate"]
     options = parser_of(__doc__, kills=10, seed=0, commands=names).parse_args()
     print(
         "| command | undisturbed, s | kills | in the middle | went on | equal results |\n"

@@ -209,6 +209,20 @@ def test_a_variable_that_a_plug_in_looks_up_counts(
     assert value not in stored.to_json(), "a value may be a secret"
 
 
+@pytest.mark.parametrize("copied", ["dict(os.environ)", "os.environ.copy()", "{**os.environ}"])
+def test_a_plug_in_that_copies_all_variables_finds_its_runs_again(
+    copied: str, tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, _ = a_plug_in(tmp_path, PLUGIN.replace("os.environ.get(", f"{copied}.get("))
+    assert made_again(spec, store, partial(monkeypatch.setenv, "IDENTITY_TOY_MODE", "fast"))
+    another = write(tmp_path / "other" / "other.py", "")
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"{another}:SPEC")
+    TRACKERS.refresh()
+    kinds: list[str] = []
+    run_many([spec], results=store, on_event=lambda event: kinds.append(event.kind))
+    assert kinds == ["reused"], "which plug-ins are listed is no input"
+
+
 def test_a_plug_in_that_is_only_listed_is_imported_by_nobody(
     tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

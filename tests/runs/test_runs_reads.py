@@ -472,6 +472,18 @@ def test_a_variable_that_is_not_set_and_that_a_plug_in_looks_up(look: str, bench
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
+@pytest.mark.parametrize(
+    "copy", ["os.environ.copy()", "dict(os.environ)", "{**os.environ}", "os.environ | {}"]
+)
+def test_a_variable_that_is_not_set_and_looked_up_in_a_copy(copy: str, bench: Bench) -> None:
+    reads = bench.record(
+        f"import os\ndef run():\n    copied = {copy}\n    return copied.get('MY_SLAM_MODE')\n"
+    )
+    assert reads.environment["$MY_SLAM_MODE"] == ""
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
 @pytest.mark.parametrize("look", LOOKS + LISTINGS)
 def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
     bench.environment["MY_SLAM_MODE"] = "fast"
@@ -667,6 +679,44 @@ def test_a_dependency_that_is_installed_anew(
 
         shutil.rmtree(bench.root / "site")
     assert bench.changed(reads) == changed
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "importlib.metadata.version('library-of-mine')",
+        "importlib.metadata.distribution('Library_of.mine').version",
+        "importlib.metadata.metadata('library_of_mine')['Version']",
+        "threading.Thread(target=importlib.metadata.version, args=['library-of-mine']).start()",
+        "os.waitpid(os.fork() or ask(), 0)",
+    ],
+)
+def test_a_version_that_is_asked_for_without_an_import(body: str, bench: Bench) -> None:
+    on_path(bench, "site")
+    install(bench.root / "site", "1.0", "one")
+    source = f"""
+import importlib.metadata, os, threading
+def ask():
+    importlib.metadata.version('library-of-mine')
+    os._exit(0)
+def run():
+    {body}
+"""
+    reads = bench.record(source)
+    assert reads.distributions["library-of-mine"].startswith("1.0 ")
+    assert "library" not in reads.modules
+    assert not [name for name in reads.files if "dist-info" in name]
+    install(bench.root / "site", "2.0", "one")
+    assert bench.changed(reads) == "library-of-mine 1.0"
+
+
+def test_listing_what_is_installed_is_no_question_for_a_version(bench: Bench) -> None:
+    on_path(bench, "site")
+    install(bench.root / "site", "1.0", "one")
+    reads = bench.record(
+        "import importlib.metadata\ndef run():\n    importlib.metadata.entry_points(group='x')\n"
+    )
+    assert "library-of-mine" not in reads.distributions
 
 
 @pytest.mark.parametrize("name", ["library.py", "library/__init__.py"])

@@ -445,7 +445,10 @@ def test_suppressed_detections_are_not_suppressed_again(tmp_path):
     ("column", "value", "words"),
     [
         (5, 2, "class numbers lie between 2 and 2, its names are numbered 0 to 1"),
-        (5, 0.5, "class numbers lie between 0.5 and 0.5"),
+        (5, 0.5, "the class number 0.5, class numbers are whole"),
+        # score and class in each other's place
+        (slice(4, 6), (0, 0.9), "the class number 0.9, class numbers are whole"),
+        (slice(4, 6), (1, 0.3), "the class number 0.3, class numbers are whole"),
         (4, 26, "scores reach 26, scores end at 1"),
         (2, 12, "boxes end before they begin, for example x 26 to 12"),
         (slice(0, 4), (0.4, 0.1, 0.6, 0.6), "boxes reach 0.6: shares of the image, not pixels"),

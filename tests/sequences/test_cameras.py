@@ -598,6 +598,39 @@ def test_a_frame_rate_that_the_stamps_contradict_is_not_taken_and_said(
     said = f"fps = {stated:g} is stated, the stamps say {rate}"
     assert (said in sequence.dropped) == (stated in (31.0, 300.0, 0.5, 15.0))
     assert ("which is taken" in sequence.dropped) == (taken != stated)
+    assert [said in remark for remark in sequence.remarks] == [True] * (said in sequence.dropped)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1.0, "depth_factor = 1: depth_factor = 5000 would give 2."),
+        (100.0, "depth_factor = 100: depth_factor = 5000 would give 2."),
+        (600_000.0, "depth_factor = 600000: depth_factor = 5000 would give 2."),
+        (1000.0, ""),
+        (5000.0, ""),
+    ],
+)
+def test_a_depth_that_nobody_could_mean_is_said_where_it_is_opened(tmp_path, factor, said):
+    folder, *_ = make_folder(tmp_path / "rec")
+    file = folder / CAMERA_FILE
+    file.write_text(file.read_text().replace("5000.0", f"{factor}"))
+    sequence = open_sequence(folder)
+    assert len(sequence.remarks) == bool(said)
+    assert all(said in remark for remark in sequence.remarks)
+    assert said in sequence.dropped
+
+
+def test_a_true_pose_that_no_camera_reaches_is_said_where_it_is_opened(tmp_path):
+    folder, *_ = make_folder(tmp_path / "rec", frames=6)
+    truth = folder / "groundtruth.txt"
+    assert "faster than" not in open_sequence(folder).dropped
+    rows = truth.read_text().splitlines()
+    rows[3] = rows[3].replace(" 0.03 ", " 1e9 ")
+    truth.write_text("\n".join(rows) + "\n")
+    assert (
+        "2 of 5 steps of the ground truth are faster than 100 m/s" in open_sequence(folder).dropped
+    )
 
 
 def test_a_bag_s_camera_states_its_unit():

@@ -166,7 +166,9 @@ def test_pairs_beside_both_lists_are_said_to_be_unused(tmp_path, name):
     pairs(folder, name, [1, 2])
     sequence = open_sequence(folder)
     assert len(sequence) == 4
-    assert f"{name} is not used: rgb.txt and depth.txt list the images" in sequence.dropped
+    said = f"{name} is not used: rgb.txt and depth.txt list the images"
+    assert said in sequence.dropped
+    assert said in sequence.remarks
 
 
 @pytest.mark.parametrize(("gone", "left"), [("depth", "rgb"), ("rgb", "depth")])

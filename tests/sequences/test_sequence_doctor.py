@@ -103,6 +103,13 @@ def apart(truth):
     return Trajectory(truth.timestamps + 1000, truth.T_world_cam)
 
 
+def moved_far(truth, index, distance_m):
+    """One pose of the truth elsewhere."""
+    poses = truth.T_world_cam.copy()
+    poses[index, 0, 3] += distance_m
+    return truth.with_poses(poses)
+
+
 def wander(seed):
     """A truth of another recording: a random walk."""
     twist = np.random.default_rng(seed).normal(0, 0.02, (FRAMES, 6)).cumsum(axis=0)
@@ -121,6 +128,8 @@ FAULTS = {
     "truth-quaternion-order, inverted": {"truth": lambda truth: written_w_first(of_poses(se3.inverse)(truth))},
     "truth-axes": {"truth": of_poses(lambda poses: poses @ BODY)},
     "truth-lever-arm": {"truth": of_poses(lambda poses: poses @ LEVER)},
+    "truth-far": {"truth": lambda truth: moved_far(truth, 15, 1e9)},
+    "truth-far, twice": {"truth": lambda truth: moved_far(moved_far(truth, 3, 50.0), 20, -2000.0)},
     "truth-sparse": {"truth": lambda truth: Trajectory(truth.timestamps[::20], truth.T_world_cam[::20])},
     "camera-focal-length": {"camera": lambda camera: replace(camera, fx=2 * camera.fx, fy=2 * camera.fy)},
     "camera-principal-point": {"camera": lambda camera: replace(camera, cx=90.0)},

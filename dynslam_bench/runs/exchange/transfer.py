@@ -39,7 +39,12 @@ from dynslam_bench.runs.exchange.formats import (
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.layout import TrajectoryKind
-from dynslam_bench.runs.make_record import judge_coverage, sequence_info, sequence_part_digest
+from dynslam_bench.runs.make_record import (
+    judge_coverage,
+    recording_notes,
+    sequence_info,
+    sequence_part_digest,
+)
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, open_store
@@ -449,7 +454,7 @@ def import_trajectory(
         provenance=provenance or stated_provenance(file) or str(file),
         place=place_of(sequence) if reference.knows_frames else "",
         stamps_match=reference.knows_frames and not coverage.n_without_frame,
-        notes=notes,
+        notes=[*notes, *reference.notes],
     ).normalised()
 
     # trajectory, stamps and ground truth into the store
@@ -509,6 +514,7 @@ class _Reference:
         ground_truth: Its ground truth, with all poses of a repeated stamp; None if it has none.
         info: What the record keeps of the sequence, by the name of its part.
         knows_frames: Whether its images are here.
+        notes: What of the recording was not used, or nobody could mean.
     """
 
     part: SequencePart
@@ -516,6 +522,7 @@ class _Reference:
     ground_truth: Trajectory | None
     info: Callable[[str], SequenceInfo]
     knows_frames: bool
+    notes: tuple[str, ...] = ()
 
 
 def _reference_by_images(opened: Sequence) -> _Reference:
@@ -527,6 +534,7 @@ def _reference_by_images(opened: Sequence) -> _Reference:
         ground_truth=opened.ground_truth,
         info=lambda name: sequence_info(opened, part.content, name),
         knows_frames=True,
+        notes=tuple(recording_notes(opened)),
     )
 
 

@@ -141,7 +141,10 @@ class Notes:
         files: Each file that was opened to be read.
         folders: The names in each folder that was listed; None where it was not there.
         variables: Environment variables that were looked up.
+        has_all_variables: Whether all of them were listed: of a copy nobody announces what is looked
+            up in it.
         modules: Top-level names of modules that were imported, or could not be.
+        metadata: Folders with the metadata of distributions whose version was asked for.
         commands: When each command was started first, in nanoseconds since the epoch.
         made: Files that the run has written or removed.
         made_folders: Beginnings of the paths of what lies in folders that it has made.
@@ -152,7 +155,9 @@ class Notes:
     files: dict[str, FileNote] = field(default_factory=dict)
     folders: dict[str, list[str] | None] = field(default_factory=dict)
     variables: set[str] = field(default_factory=set)
+    has_all_variables: bool = False
     modules: set[str] = field(default_factory=set)
+    metadata: set[str] = field(default_factory=set)
     commands: dict[Command, int] = field(default_factory=dict)
     made: set[str] = field(default_factory=set)
     made_folders: tuple[str, ...] = ()
@@ -239,7 +244,10 @@ class Collector:
         links = {path: link_now(path, self._base_folders) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
         variables |= self._variables_in(files)
-        used_distributions = modules.distributions.keys() | distributions
+        asked_for = {
+            name for name, folder in imports.distributions.items() if folder in self.notes.metadata
+        }
+        used_distributions = modules.distributions.keys() | distributions | asked_for
 
         name = self._base_folders.name
         return Reads(
@@ -496,8 +504,11 @@ class Collector:
     def _variables_in(self, files: Iterable[str]) -> set[str]:
         """The variables that foreign libraries, or sources that name ``getenv``, hold the names of.
 
-        Machine code looks variables up unannounced. Of a library those count that are set.
+        Machine code looks variables up unannounced. Of a library those count that are set. Where all
+        variables were listed, sources count that name ``environ``: one that is not set may be looked
+        up in a copy.
         """
+        marks = [b"getenv", b"environ"] if self.notes.has_all_variables else [b"getenv"]
         names: set[str] = set()
         set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
         for file in files:
@@ -505,7 +516,8 @@ class Collector:
             if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
                 continue
             if file.endswith(".py"):
-                if b"getenv" in Path(file).read_bytes():
+                content = Path(file).read_bytes()
+                if any(mark in content for mark in marks):
                     names |= {word for word in self._words(file) if _VARIABLE.fullmatch(word)}
             elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
                 content = Path(file).read_bytes()

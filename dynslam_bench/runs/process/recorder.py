@@ -86,6 +86,8 @@ _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
 """Folders in which a distribution is described."""
+_VERSIONS = (f".dist-info{os.sep}METADATA", f".egg-info{os.sep}PKG-INFO")
+"""Ends of the paths of files that tell the version of a distribution."""
 _WORD_OF_CODE = re.compile(r"[^\s;|&<>()'\"`$,]+")
 """A word of a line of code that can be the name of a file."""
 _LOG = "reads-{}.jsonl"
@@ -278,7 +280,7 @@ class ReadRecorder:
             return
         if _ENVIRONMENT.fullmatch(path):
             if self._is_asked_by_foreign(frame):
-                self._note_variables(self._collector.environment)
+                self._note_all_variables()
             return
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
@@ -329,6 +331,9 @@ class ReadRecorder:
         """
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
+        if path.endswith(_VERSIONS):
+            self._read_version(frame, os.path.dirname(path))
+            return
         stamp = stamp_of(path)
         note = self._notes.files.get(path)
         if note is not None:
@@ -348,6 +353,12 @@ class ReadRecorder:
             note.digest = _sha256(path)
         self._notes.files[path] = note
         self._note("file", path)
+
+    def _read_version(self, frame: FrameType, folder: str) -> None:
+        """Note a distribution whose version is asked for, by the folder of its metadata."""
+        if folder not in self._notes.metadata and self._is_asked_by_foreign(frame):
+            self._notes.metadata.add(folder)
+            self._note("metadata", folder)
 
     def _source_of(self, path: str) -> str:
         """The source of byte code, any other path as it is.
@@ -457,13 +468,19 @@ class ReadRecorder:
 
     def _on_all_variables(self, frame: FrameType) -> None:
         if self._is_asked_by_foreign(frame.f_back):
-            self._note_variables(self._collector.environment)
+            self._note_all_variables()
 
     def _on_variable_set(self, _: FrameType, name: Any) -> None:
         self._notes.made.add(f"${_variable_name(name)}")
 
     def _on_declared_variable(self, _: FrameType, name: str) -> None:
         self._note_variables([name])
+
+    def _note_all_variables(self) -> None:
+        if not self._notes.has_all_variables:
+            self._notes.has_all_variables = True
+            self._note("all variables", "")
+        self._note_variables(self._collector.environment)
 
     def _note_variables(self, names: Iterable[str]) -> None:
         for name in names:
@@ -578,6 +595,10 @@ class ReadRecorder:
                     self._notes.variables.add(name)
                 case "module":
                     self._notes.modules.add(name)
+                case "all variables":
+                    self._notes.has_all_variables = True
+                case "metadata":
+                    self._notes.metadata.add(name)
                 case "command":
                     words, folder = json.loads(name)
                     command = Command(tuple(words), folder)

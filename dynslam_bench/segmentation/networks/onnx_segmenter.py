@@ -304,7 +304,7 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
     Args:
         boxes: Corners ``[K, 4]`` of those with the least score or more.
         scores: ``[K]``.
-        labels: Class numbers ``[K]``, real numbers as the network gives them.
+        labels: Class numbers ``[K]``.
         layout: Named in the error.
     """
     if not scores.size:
@@ -314,10 +314,10 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
         raise SegmentationError(
             f"the network's scores reach {scores.max():.4g}, scores end at 1", hint
         )
-    # class numbers must be whole, and have a name
+    # class numbers must have a name
     least = float(labels.min())
     most = float(labels.max())
-    if least < 0 or most > max(layout.names) or (labels != np.rint(labels)).any():
+    if least < 0 or most > max(layout.names):
         raise SegmentationError(
             f"the network's class numbers lie between {least:.4g} and {most:.4g}, its names are numbered "
             f"{min(layout.names)} to {max(layout.names)}",
@@ -361,8 +361,14 @@ def _decode_yolo(
     # corners, scores and class numbers; those that are kept
     boxes, best, numbers = _corners(rows) if layout.suppressed else _best(rows, first, layout)
     above = best >= floor
+    fractions = numbers[numbers != np.rint(numbers)]
+    if len(fractions):  # also of low scores: where score and class are swapped all scores may be 0
+        raise SegmentationError(
+            f"the network gives the class number {fractions[0]:.4g}, class numbers are whole",
+            f"detections of '{layout.id}' are corners, score, class, coefficients, in this order; export it so",
+        )
     _check_detections(boxes[above], best[above], numbers[above], layout)
-    labels = np.rint(numbers).astype(np.intp)
+    labels = numbers.astype(np.intp)
     keep = _keep(boxes, best, labels, layout, settings, floor)
 
     # masks: the prototypes weighted by a detection's coefficients, inside its box

@@ -17,6 +17,7 @@ from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, Trajectory, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
+from dynslam_bench.geometry.speeds import impossible_motion
 from dynslam_bench.sequences.readers.files import Contents, ImageList
 from dynslam_bench.sequences.view import Masks
 
@@ -32,6 +33,10 @@ RATES_CONTRADICT = 3.0
 """Nobody means a frame rate that differs from the stamps' by this factor; the stamps' is taken."""
 LONGEST_READOUT = 2.0
 """Times between two images that a stated readout may last: built-in cameras are used at twice their rate, too."""
+DEPTH_RANGE_M = (0.1, 60.0)
+"""Median depths outside of this range are in another unit than metres."""
+USUAL_FACTORS = (1.0, 100.0, 1000.0, 5000.0)
+"""Raw units a metre of public data: metres, centimetres, millimetres, TUM's."""
 MISSING_TOLERATED = 0.02
 """Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
@@ -72,6 +77,8 @@ class RecordedSequence:
         fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by
             `RATES_CONTRADICT`, the inverse of the median interval (30 for one frame).
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
+        remarks: Of that line the phrases that tell more than numbers of images and poses: files
+            that were not used, a frame rate or a depth that nobody could mean.
         taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
             unit; ground truth, and all that was not taken as it stands.
 
@@ -135,7 +142,9 @@ class RecordedSequence:
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth, turned = _truth_of_camera(contents.truth, camera)
 
-        # one line on what was not used
+        # what was not used, or nobody could mean; most damage shows in the first frame
+        remarks = [*contents.notes, *notes, rate_note, self._doubtful_depth(self[0].depth)]
+        self.remarks = tuple(remark for remark in remarks if remark)
         counts = {
             "colour images without depth": len(colour) - len(self),
             "depth images unused": len(depth) - len(self),
@@ -149,9 +158,8 @@ class RecordedSequence:
             "" if self.ground_truth else "no ground truth",
             contents.truth_dropped,
             turned,
-            *contents.notes,
-            *notes,
-            rate_note,
+            self._doubtful_truth(),
+            *self.remarks,
         ]
         self.dropped = "; ".join(phrase for phrase in phrases if phrase)
 
@@ -170,8 +178,30 @@ class RecordedSequence:
             or "all images and poses are used",
         )
 
-        # most damage shows in the first frame
-        self[0]
+    def _doubtful_depth(self, depth: NDArray[np.float32]) -> str:
+        """A phrase where the first image's median depth is in no unit that its factor can mean; empty otherwise."""
+        measured = depth[depth > 0]
+        if not len(measured):
+            return ""
+        median = float(np.median(measured))
+        if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
+            return ""
+        factor = self.camera.depth_factor
+        fault = f"the first depth image is {median:.3g} m away by the median"
+        if factor is None:
+            return f"{fault}: are its numbers metres?"
+        likely = likely_factor(median * factor)
+        cure = "no usual factor fits"
+        if likely is not None:
+            cure = f"depth_factor = {likely:g} would give {median * factor / likely:.3g} m"
+        return f"{fault}, with depth_factor = {factor:g}: {cure}"
+
+    def _doubtful_truth(self) -> str:
+        """A phrase where the truth moves as no camera does; empty otherwise."""
+        if self.ground_truth is None:
+            return ""
+        motion = impossible_motion(self.ground_truth, "ground truth")
+        return "" if motion is None else str(motion)
 
     def _mask_files(self, people: ImageList) -> list[str]:
         """The mask of each frame; all have to have one of their stamp."""
@@ -258,6 +288,11 @@ class RecordedSequence:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
+
+
+def likely_factor(raw: float) -> float | None:
+    """The first usual depth factor with which a median raw number is 0.4 to 8 m; None where there is none."""
+    return next((factor for factor in USUAL_FACTORS if 0.4 < raw / factor < 8), None)
 
 
 def _check_inside(folder: Path, contents: Contents) -> None:
