@@ -51,7 +51,8 @@ def same_frames(one: list[str], other: list[str]) -> bool:
 def _encode(rgb: NDArray[np.uint8]) -> str:
     """A colour image ``[H, W, 3]``, reduced to grey."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return base64.b64encode(cv2.resize(grey, _SIZE, interpolation=cv2.INTER_AREA)).decode()
+    small = cv2.resize(grey, _SIZE, interpolation=cv2.INTER_AREA)
+    return base64.b64encode(small.tobytes()).decode()
 
 
 def _same_picture(one: str, other: str) -> bool:
