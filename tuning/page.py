@@ -349,7 +349,7 @@ def _scenes_figure(
                 marker={
                     "color": colour,
                     "size": 11,
-                    "symbol": ["x" if each else "circle" for each in lost],
+                    "symbol": ["x" if is_lost else "circle" for is_lost in lost],
                 },
                 hovertemplate="%{y}<br>%{x:.3g} mm<extra>%{fullData.name}</extra>",
             )

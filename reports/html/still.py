@@ -212,7 +212,7 @@ def _draw_scatter(axes: Axes, trace: Any, x: Array, y: Array) -> None:
     size = _POINTS_PER_PIXEL * (marker.size if isinstance(marker.size, int | float) else 6)
     is_seen = trace.opacity != 0
     for symbol in dict.fromkeys(symbols):
-        here = np.array([each == symbol for each in symbols])
+        here = np.array([drawn == symbol for drawn in symbols])
         axes.plot(
             x[here],
             y[here],
