@@ -65,7 +65,7 @@ class ModuleCode:
     """One module's source: digest, imports and the names that it imports.
 
     Attributes:
-        digest: Digest of the source's syntax, see `syntax_digest`.
+        digest: Digest of the source's syntax, see `_tree_digest`; of its bytes where it cannot be parsed.
         imports: What it imports from this package.
         names: What each name stands for that it imports at its top level, by the name that it has
             in this module.
@@ -332,20 +332,11 @@ def parsed(source: bytes) -> ast.Module:
         return ast.parse(source)
 
 
-def syntax_digest(source: bytes) -> str:
+def _tree_digest(tree: ast.Module) -> str:
     """SHA-256 of a Python source's syntax tree without comments, layout and docstrings.
 
-    It does not depend on the version of Python that parses it. What cannot be parsed counts by its
-    bytes.
+    It does not depend on the version of Python that parses it.
     """
-    try:
-        return _tree_digest(parsed(source))
-    except (SyntaxError, ValueError, RecursionError):
-        return hashlib.sha256(source).hexdigest()
-
-
-def _tree_digest(tree: ast.Module) -> str:
-    """`syntax_digest` of a source that is parsed already."""
     tokens: list[str] = []
     _append_tokens(tree, tokens)
     return hashlib.sha256("\0".join(tokens).encode(errors="backslashreplace")).hexdigest()
