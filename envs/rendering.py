@@ -68,7 +68,10 @@ class Canvas:
         self._truth_path = positions @ VIEWS[self._view].T
 
     def draw(self, frame: Frame, result: TrackResult, episode: Episode) -> Image:
-        """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, red first."""
+        """The picture of the episode's last frame, uint8 ``[544, W + 480, 3]``, RGB.
+
+        W is the image's width at 480 rows.
+        """
         # estimated centres [N, 3] in the first camera's frame, cut where the tracker was lost
         centres, pieces, ate_m = align_to_truth(episode, self._truth)
         # image and plot side by side, the line of numbers below

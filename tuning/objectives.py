@@ -220,7 +220,7 @@ Cost = Callable[[Outcome], float]
 """Positive number of a run, less is better."""
 WORST_SHARE = 0.25
 """Share of the scenes, the worst ones, that the worst case is the mean of; always one at least."""
-_MANY = 1e9
+_ABOVE_FLOOR = 1e9
 """Factor of a user's costs, which lifts them above `FLOOR_M`; it cancels out of ratios."""
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
@@ -429,8 +429,8 @@ def own_objective(cost: Cost) -> Objective:
                 f"objective '{name}' gives {given!r} on instance '{run.instance}'",
                 "return a number above 0",
             )
-        # the floor of errors in metres does not apply; ratios stay as they are
-        return _MANY * value
+        # lifted above `FLOOR_M`, which would raise small values to it; the factor cancels out of ratios
+        return _ABOVE_FLOOR * value
 
     return Objective(name, name.replace("_", " "), checked)
 

@@ -349,12 +349,12 @@ def _scenes_figure(
                 marker={
                     "color": colour,
                     "size": 11,
-                    "symbol": ["x" if each else "circle" for each in lost],
+                    "symbol": ["x" if is_lost else "circle" for is_lost in lost],
                 },
                 hovertemplate="%{y}<br>%{x:.3g} mm<extra>%{fullData.name}</extra>",
             )
         )
-    layout = {
+    layout: dict[str, Any] = {
         "template": {},
         "height": 130 + 22 * len(names),
         "xaxis": mm_axis("absolute trajectory error (mm), left is better"),

@@ -251,7 +251,7 @@ def _undeclared(name: str, value: Any) -> Parameter:
 
 
 def _with_range(parameter: Parameter, span: Range, settings: Settings) -> Parameter:
-    """A parameter with a study's range in place of its own.
+    """A parameter with a study's range in place of its own; the range's step is only checked here.
 
     Raises:
         StudyError: The setting is no number, or it does not take an end of the range.
@@ -263,6 +263,7 @@ def _with_range(parameter: Parameter, span: Range, settings: Settings) -> Parame
             f"'{name}' takes no range: it is {what}", f'write space.choices."{name}" = [...]'
         )
     scale = span.scale or parameter.scale
+    # a step and a log scale exclude each other
     if span.step and span.scale is None:
         scale = "linear"
     numbers = {"low": span.low, "high": span.high} | ({"step": span.step} if span.step else {})

@@ -552,7 +552,7 @@ def event_text(event: runs.RunEvent) -> str:
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind == "started":
         # nothing is heard of a run before its first frames
-        return f"{text}, starting: a first run compiles its code"
+        return f"{text}, starting"
     if event.kind != "progress" or event.partial is None:
         return text
     done = event.partial["frames_done"]

@@ -64,7 +64,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class SegmenterContext:
-    """The surroundings in which a segmenter runs: sequence, device, threads, source.
+    """What a segmenter may know of its run: sequence, device, threads, source.
 
     Attributes:
         sequence_id: Id of the sequence.

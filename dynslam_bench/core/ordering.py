@@ -59,11 +59,11 @@ def median(values: NDArray[np.float64]) -> float:
             first = i
         else:
             break
-    upper = values[middle]
+    upper: float = values[middle]
     if len(values) % 2 == 1:
         return upper
     # none to the left of the upper middle is larger: the largest of them is the lower middle
-    lower = values[0]
+    lower: float = values[0]
     for k in range(1, middle):
         lower = max(lower, values[k])
     return (lower + upper) / 2

@@ -106,21 +106,26 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
         )
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
-        """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
+        """This frame's points as earlier frames saw them: world position and covariance ``[K, N, 3 + 9]``.
+
+        Newest frame first; NaN where a point was not observed.
+        """
         previous = state.previous
         pose = state.T_world_prev
         flow = state.flow
         if previous is None or pose is None or flow is None or len(self._last) != len(previous.xy):
             return np.zeros((0, len(frame.xy), 12))
 
-        # a point that continues a keypoint of the last frame takes over its observations
+        # a point that continues a keypoint of the last frame takes over its track: `_last` in camera axes,
+        # `_past` in the world
         link = link_to_previous(frame, state)
         last = _in_world(self._last, pose)
         of_keypoints = np.concatenate([last[None], self._past])[: self.settings.window]
         past = np.full((len(of_keypoints), len(frame.xy), 12), np.nan)
         past[:, link >= 0] = of_keypoints[:, link[link >= 0]]
 
-        # any other was at the end of its flow, at the depth that the last frame has there
+        # any other has one observation: its flow leads back to a pixel of the last frame,
+        # where that frame's depth image gives the depth
         unlinked = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
         raw = flow.xy[unlinked]
         pixels, visible = pixel_index(raw, previous.depth.shape)

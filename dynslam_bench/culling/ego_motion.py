@@ -187,9 +187,17 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
 def _motion_of_distant_points(
     start: Array, points: Array, pixels: Array, weight: Array, camera: Intrinsics
 ) -> tuple[Array, float] | None:
-    """The motion ``[4, 4]`` that begins with the distant points, without a prior, and the scale of its kernel, pixels.
+    """The motion ``T_prev_cur`` ``[4, 4]`` by the distant points first, and the scale of its kernel, pixels.
 
-    None where too few points agree. Arguments as of `_align`.
+    Distant points are rarely on a moving object, so nothing nearby can take this estimate along;
+    it has no prior. None where too few points agree.
+
+    Args:
+        start: The motion to begin with ``[4, 4]``.
+        points: ``[N, 3]`` in this camera's frame, metres.
+        pixels: Undistorted pixels ``[N, 2]`` in the previous image.
+        weight: Share of static keypoints around each, ``[N]`` in [0, 1].
+        camera: Intrinsics.
     """
     # distant: beyond the geometric mean of near and far depths
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
@@ -200,7 +208,7 @@ def _motion_of_distant_points(
     if agreeing < MIN_AGREEING:
         return None
 
-    # all points, under a kernel as wide as the distant points' residuals are
+    # all points: two steps of the whole pose, under a kernel as wide as the distant points' residuals
     noise = np.sqrt(np.median(_squared_errors(T_prev_cur, points[far], pixels[far], camera)))
     scale = np.clip(3 * noise, *NOISE_PX)
     T_prev_cur, agreeing = _align(

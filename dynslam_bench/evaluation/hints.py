@@ -93,19 +93,20 @@ def hints(
     # wrong convention and late stamps; a convention that is undone may show another time shift
     stamps = estimate.timestamps[inside]
     poses = estimate.T_world_cam[inside]
-    shift, left = _time_shift(stamps, poses, truth)
+    # seconds to add to the stamps, and the share of the displacements that stays unexplained then
+    shift, unexplained = _time_shift(stamps, poses, truth)
     wrong, poses = _wrong_convention(stamps, poses, truth, shift)
     if wrong:
-        shift, left = _time_shift(stamps, poses, truth)
-    late = _shift_hint(stamps, poses, truth, shift, left) if shift else []
+        shift, unexplained = _time_shift(stamps, poses, truth)
+    late = _shift_hint(stamps, poses, truth, shift, unexplained) if shift else []
     faults += wrong + late
 
-    # scale and noise, at the stamps that are meant
+    # scale and noise, at the stamps with the time shift undone
     shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps = stamps[covered] + shift
     poses = poses[covered]
-    if not sim3 and left < MOSTLY:
+    if not sim3 and unexplained < MOSTLY:
         faults += _scale(stamps, poses, truth)
     return (*faults, *_below_noise(stamps, poses, truth))
 

@@ -2,7 +2,8 @@
 
 FAST, BRIEF and the back end's thresholds are made for images of VGA's width. In a narrower image a
 descriptor covers more of the scene, fewer features fit, the border without any is wider, and a
-corner is located to a pixel that is larger. Enlarged to that width, 320x240 and 160x120 lose little.
+corner is located to a pixel that is larger. Enlarged to that width, an image of 320x240 gives poses
+as exact as one of 640x480.
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ def enlarged_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if feature_scale(mask.shape[1]) == 1:
         return mask
     size = _enlarged_size(mask)
-    return cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    return np.asarray(
+        cv2.resize(mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    )
 
 
 def in_given_image(keypoints: Keypoints, given: NDArray[np.uint8]) -> Keypoints:
     """Keypoints of the `enlarged` image in pixels of the one that was given."""
-    scale = feature_scale(given.shape[1])
-    if scale == 1:
+    if feature_scale(given.shape[1]) == 1:
         return keypoints
     # the centres of the first pixels differ, their outer edges do not
     size = np.array(given.shape[::-1], np.float32)

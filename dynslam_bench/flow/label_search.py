@@ -845,9 +845,17 @@ def count_inliers(
 
 
 def nearest(points: Floats, run: Run) -> Longs:
-    """Indices ``[N, K]`` of each point's nearest others; `run` divides the work among threads."""
+    """Indices of each point's nearest others, nearest first; approximate, see `nearest_neighbours`.
+
+    Args:
+        points: ``[N, 2]``, pixels.
+        run: Divides the points among threads.
+
+    Returns:
+        int64 ``[N, K]``, K = `MOST_NEIGHBOURS` or N - 1; -1 where there are fewer.
+    """
     n = len(points)
-    neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
+    neighbours = np.empty((n, max(0, min(MOST_NEIGHBOURS, n - 1))), dtype=np.int64)
     if n > 1:
         order = np.argsort(points[:, 0], kind="stable")
         run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)

@@ -86,7 +86,7 @@ class GateResult(Record):
         ratio: Mean ratio of the errors over the sequences; None where nothing could be compared.
         low: Lower end of its interval; None without one.
         high: Upper end.
-        level: Two-sided level of the interval; None without one.
+        level: Two-sided error level (alpha) of the interval: 0.04 is a 96 % interval; None without one.
         lost: Runs that the candidate lost, and the baseline.
         cases: Every sequence.
         guardrails: The guardrails that were asked for.
@@ -159,12 +159,13 @@ class GateResult(Record):
         return f"Worst of {len(self.cases)}{unlisted}: {worst.case}, x {worst.ratio:.3f}."
 
     def _sure_words(self) -> str:
-        """How sure the verdict is: rounds, interval and level."""
+        """How sure the verdict is: rounds, interval and its confidence, the share of false alarms."""
         words = f"{self.runs} runs in {self.rounds} round{'s' * (self.rounds != 1)}"
         if self.verdict is GateVerdict.IDENTICAL:
             return f"{words}, equal to the last bit."
         if self.low is None or self.high is None or self.level is None:
             return f"{words}: too few to tell scatter from change."
+        # `LOOKS` of `evaluation.gate` share 4 %, as much as `ONE_LOOK`
         return (
             f"{words}; mean ratio [{self.low:.3f}, {self.high:.3f}] at {100 * (1 - self.level):.1f} %, "
             "false alarms 4 % in all looks."

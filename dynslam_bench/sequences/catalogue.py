@@ -420,11 +420,6 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         says whether the reader was ``verified`` on the publisher's files or ``not verified``;
         ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before
         it is fetched, None for what is rendered.
-        are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
-        ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout`` says
-        whether the reader was ``verified`` on the publisher's files or ``not verified``;
-        ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before it
-        is fetched, None for what is rendered.
     """
     root = find_data_root(data_root)
     rows = []
@@ -442,7 +437,7 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
 
 
 def _blank_summary(spec: DatasetSpec, name: str) -> dict[str, Any]:
-    """The row of a sequence of which only the data set is known."""
+    """A row of `summaries` with its defaults: the sequence of a plug-in, which is taken to be on this machine."""
     return {
         "id": name,
         "here": True,

@@ -22,14 +22,15 @@ people who move between two frames 10 to 150."""
 
 
 def thumbnails(sequence: Sequence) -> list[str]:
-    """Small grey pictures of a few frames of a recording whose camera never moves.
+    """Small grey pictures of a few frames of a recording whose camera never moves: copies of it are found by them.
 
     Args:
         sequence: With its ground truth, cut to what a run shows.
 
     Returns:
         Up to `COUNT` pictures of 16 x 12 pixels, a byte each, in base 64. Empty for rendered scenes,
-        which have digests, for cameras that move, whose true poses tell, and without ground truth.
+        which have digests, for cameras that move, whose true poses tell copies apart, and without
+        ground truth.
     """
     truth = sequence.ground_truth
     is_rendered = hasattr(sequence, "scene_digest")
@@ -50,7 +51,8 @@ def same_frames(one: list[str], other: list[str]) -> bool:
 def _encode(rgb: NDArray[np.uint8]) -> str:
     """A colour image ``[H, W, 3]``, reduced to grey."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return base64.b64encode(cv2.resize(grey, _SIZE, interpolation=cv2.INTER_AREA)).decode()
+    small = cv2.resize(grey, _SIZE, interpolation=cv2.INTER_AREA)
+    return base64.b64encode(small.tobytes()).decode()
 
 
 def _same_picture(one: str, other: str) -> bool:

@@ -562,6 +562,8 @@ class Backend:
         """
         timings: dict[str, float] = {}
         root_map_pose = RootMapPose.REJECTED
+        # the history keeps the pose by the image alone, which `trajectory` smooths at the end;
+        # `tracked` holds the fused one
         pose = map_fit.estimate.T_cam_world
         needed = pose_in_root_map is not None or self._keyframe_policy.needs_keyframe(
             self.map, tracked, frame.index, self._reference_keyframe

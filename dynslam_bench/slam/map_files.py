@@ -116,7 +116,8 @@ class MapFeatures(Record):
 
     def scales(self, width: int) -> NDArray[np.float64]:
         """Pixels of an image of a width in a pixel of each level, ``[levels]``."""
-        return feature_scale(width) * self.scale_factor ** np.arange(self.levels, dtype=np.float64)
+        octaves = self.scale_factor ** np.arange(self.levels, dtype=np.float64)
+        return np.asarray(feature_scale(width) * octaves)
 
 
 class MapHeader(Record):

@@ -531,9 +531,9 @@ def least_masked(
         needed: How many features must remain.
     """
     # distance of each feature from the mask's outside
-    depth = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside_px = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     at, _ = pixel_index(xy, mask.shape)
-    masked_px = depth[at]
+    masked_px = outside_px[at]
 
     # as many of the dropped ones as are missing
     dropped = np.flatnonzero(~keep)

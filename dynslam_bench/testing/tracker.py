@@ -210,7 +210,7 @@ class _Runner:
 
 
 def _results_of(final: Trajectory, frames: list[Frame]) -> list[TrackResult]:
-    """The final trajectory of a tracker that has no other one, frame by frame."""
+    """Results by the final trajectory, of a tracker without poses while it runs: a frame without one counts as lost."""
     poses = dict(zip(final.timestamps.tolist(), final.T_world_cam, strict=True))
     results = []
     for frame in frames:

@@ -116,13 +116,13 @@ def resource(name: str) -> str:
 def _assets() -> dict[str, str]:
     """The files that all pages share: plotly, DataTables, our style and scripts."""
     bundle = files("itables") / "html"
-    # a page in a folder loads no modules
-    tables, exports = re.subn(
+    # browsers load no ES modules from file:// pages: make the bundle a plain script
+    tables, replaced = re.subn(
         r"export\s*\{[^}]*?([\w$]+) as default[^}]*\};?",
         r"globalThis.DataTable=\1;",
         (bundle / "dt_bundle.js").read_text(encoding="utf-8"),
     )
-    assert exports == 1, "the DataTables bundle of itables exports its class"
+    assert replaced == 1, "the DataTables bundle of itables replaced its class"
     return {
         "plotly.min.js": get_plotlyjs(),
         "datatables.js": f"(()=>{{{tables}\n}})();",

@@ -16,9 +16,12 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import blended_transform_factory
+from numpy.typing import NDArray
 from plotly.colors import unlabel_rgb
 
 from dynslam_bench.reports.figures import NEUTRAL
+
+Array = NDArray[np.float64]
 
 WIDTH_INCHES = 9.6
 """Width of a picture: that of a page of paper between its margins."""
@@ -46,7 +49,7 @@ _DASHES = {"solid": "-", "dash": "--", "dot": ":", "dashdot": "-."}
 _POINTS_PER_PIXEL = 0.75
 _NARROW = 6.0
 """A logarithmic axis that ends below so many times its beginning has evenly spaced labels: 1, 2 and 5 are too few."""
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     # letters stay letters, and names with a dollar sign are no formulas
     "svg.fonttype": "none",
     "svg.hashsalt": "dynslam-bench",
@@ -183,7 +186,7 @@ def _one_colour(colour: object) -> str | tuple[float, float, float]:
     return (red / 255, green / 255, blue / 255)
 
 
-def _draw_scatter(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray) -> None:
+def _draw_scatter(axes: Axes, trace: Any, x: Array, y: Array) -> None:
     """Draw a trace's line, its points and their error bars."""
     mode = trace.mode or "lines"
     label = _legend_label(trace)
@@ -209,7 +212,7 @@ def _draw_scatter(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray) -> None:
     size = _POINTS_PER_PIXEL * (marker.size if isinstance(marker.size, int | float) else 6)
     is_seen = trace.opacity != 0
     for symbol in dict.fromkeys(symbols):
-        here = np.array([each == symbol for each in symbols])
+        here = np.array([drawn == symbol for drawn in symbols])
         axes.plot(
             x[here],
             y[here],
@@ -224,7 +227,7 @@ def _draw_scatter(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray) -> None:
         label = None
 
 
-def _draw_bars(axes: Axes, trace: Any, x: np.ndarray, y: np.ndarray, width: float) -> None:
+def _draw_bars(axes: Axes, trace: Any, x: Array, y: Array, width: float) -> None:
     """Draw a trace's bars, with the words above them."""
     axes.bar(
         x,
@@ -268,7 +271,7 @@ def _names(axis: Any, columns: Iterable[Any]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _places(values: Sequence[Any] | None, names: Sequence[str]) -> np.ndarray:
+def _places(values: Sequence[Any] | None, names: Sequence[str]) -> Array:
     """Values along an axis as numbers ``[N]``: a name's place, nan for None."""
     place_of: Mapping[Any, float] = {name: float(place) for place, name in enumerate(names)}
     numbers = []

@@ -231,8 +231,9 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
 def scored_as(alignment: str, sequence: str, protocol: Protocol) -> bool:
     """Whether a published number was scored as a protocol scores, as far as is known.
 
-    A table of a system with depth that states no alignment is taken for TUM's. What is aligned by
-    Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
+    A table of a system with depth that states no alignment is taken for TUM's, SE(3). Numbers
+    aligned by Sim(3) come from WildGS-SLAM's tables, which are scored against a corrected truth on
+    Bonn. Nobody publishes numbers of a protocol that compares only some of the frames.
     """
     truth = "bonn-droid-w" if alignment == "Sim(3)" and sequence.startswith("bonn/") else "as-is"
     if protocol.thins or truth != protocol.truth:

@@ -179,7 +179,7 @@ def to_markdown(table: Table) -> str:
 
 
 def csv_text(frame: pd.DataFrame) -> str:
-    """A frame as CSV that a spreadsheet may open, a terminal may show: nothing is a formula or an escape.
+    """A DataFrame as CSV that is safe in spreadsheets and terminals: no cell is a formula or an escape sequence.
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """

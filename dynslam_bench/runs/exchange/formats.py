@@ -34,7 +34,7 @@ from dynslam_bench.slam.map_files import Cloud
 def read_trajectory(
     path: str | Path, timestamps: str | Path | None = None, topic: str | None = None
 ) -> TumFile:
-    """Read a trajectory with the counts of what was not taken as it stands.
+    """Read a trajectory, with counts of the lines that were skipped, sorted or repaired (`FileNotes`).
 
     Args:
         path: A file in TUM's or KITTI's format, a table with a heading such as EuRoC's or

@@ -179,8 +179,10 @@ class ReadRecorder:
             RunError: Something has changed while the run read it, so that nobody knows what it
                 read.
         """
-        self._look_at_programs(0.0)
+        # a last look at all programs, however young, while they still run
+        self._look_at_programs(least_age_s=0.0)
         self.stop()
+        # what processes forked from this one have logged
         self._add_forked()
         if self._error is not None:
             raise self._error

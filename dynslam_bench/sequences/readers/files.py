@@ -202,8 +202,8 @@ def list_folder(folder: Path, kind: str, fps: float | None) -> ImageList:
 
 def _numbers_in(stems: list[str]) -> list[int]:
     """The whole numbers in names that differ in nothing else; empty where there are other names."""
-    found = [_NUMBERED.fullmatch(stem) for stem in stems]
-    matches = [match for match in found if match is not None]
+    numbered = [_NUMBERED.fullmatch(stem) for stem in stems]
+    matches = [match for match in numbered if match is not None]
     around = {(match["before"], match["behind"]) for match in matches}
     if len(matches) < len(stems) or len(around) != 1:
         return []
@@ -269,12 +269,12 @@ def stamps_of_numbers(
     step = float(np.median(steps)) if steps else 1.0
     likely = _unit_of_steps(step, fps)
     if likely is not None:
-        raise _which_reading(step, fps, likely, files, numbers, folder)
+        raise _ambiguous_numbers_error(step, fps, likely, files, numbers, folder)
 
     # frame numbers: a rate turns them into time
     if fps is None:
-        found = files[0].partition("/")[0]
-        kind = next((kind for kind, names in FOLDERS.items() if found in names), found)
+        folder_name = files[0].partition("/")[0]
+        kind = next((kind for kind, names in FOLDERS.items() if folder_name in names), folder_name)
         raise NoRateError(
             f"{files[0]} of {folder} is named by a frame number, which has no time",
             f"write {kind}.txt with lines 'timestamp {files[0]}', or 'fps = 30' into the camera.toml that is used (the "
@@ -300,7 +300,7 @@ def _unit_of_steps(step: float, fps: float | None) -> str | None:
     return likely if agrees_with_fps or step / fps > _SLOWEST_BY_NUMBER_S else None
 
 
-def _which_reading(
+def _ambiguous_numbers_error(
     step: float, fps: float | None, unit: str, files: list[str], numbers: list[int], folder: Path
 ) -> SequenceError:
     """Names that are frame numbers or stamps: both readings, and the list that decides."""

@@ -77,7 +77,7 @@ class RecordedSequence:
         fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by
             `RATES_CONTRADICT`, the inverse of the median interval (30 for one frame).
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
-        remarks: Of that line the phrases that tell more than numbers of images and poses: files
+        remarks: Phrases of that line that tell more than numbers of images and poses: files
             that were not used, a frame rate or a depth that nobody could mean.
         taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
             unit; ground truth, and all that was not taken as it stands.

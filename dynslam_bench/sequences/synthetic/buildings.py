@@ -197,23 +197,28 @@ def _corridor(building: _Building) -> Walk:
     """A ring of four corridors, 2.4 m wide, around a core."""
     rng = stream(building.scene, "synthetic", "ring")
     plan = plan_room(building.scene, 0)
+    # half sides of the rectangle along the middle of the corridors, and half their width, metres
     x = pick(rng, building.scene, 9.6, 10.2)
     y = pick(rng, building.scene, 5.6, 6.0)
-    width = 1.2
-    building.parts += floor((-x - width, -y - width), (x + width, y + width), plan)
+    half_width = 1.2
+    building.parts += floor(
+        (-x - half_width, -y - half_width), (x + half_width, y + half_width), plan
+    )
 
     # the outer walls, then those of the core; both are furnished towards the corridor.
     for sign in (1, -1):
-        for start, end in _around(x + sign * width, y + sign * width):
+        for start, end in _around(x + sign * half_width, y + sign * half_width):
             building.parts += partition(start, end, plan)
             wall = np.array(end) - start
 
             # bays every 2.3 m, and before every third one a loose piece.
             length = float(norm(wall))
             yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
+            # 5 cm into the corridor: from the wall's middle to its face
             inward = sign * np.array([-wall[1], wall[0]]) / length * 0.05
             count = int(length / 2.3)
             for k in range(count):
+                # repeated walls: the four kinds of bay in turn
                 at = np.array(start) + wall * (k + 0.5) / count + inward
                 building.bay(
                     corridor_bay, yaw, (float(at[0]), float(at[1])), alike=building.bays % 4

@@ -38,7 +38,17 @@ class Worker:
     def track(
         self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
     ) -> dict[str, Any]:
-        """One frame; without depth in monocular mode."""
+        """Track one frame.
+
+        Args:
+            index: Number of the frame; ORB-SLAM3 does not need it.
+            timestamp: Seconds.
+            rgb: uint8 ``[H, W, 3]``.
+            depth: float32 ``[H, W]``, metres; unused in monocular mode.
+
+        Returns:
+            State, camera-to-world pose as nested lists or None, counts, and seconds by stage.
+        """
         if self._final is not None:
             raise RuntimeError(
                 "finalize() has stopped ORB-SLAM3's threads: only reset() starts again"

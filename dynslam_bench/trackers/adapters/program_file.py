@@ -706,7 +706,7 @@ class BatchSettings(Settings):
         Raises:
             SettingsError: It is missing or damaged.
         """
-        check_described(self, BatchSettings, self.program, "batch")
+        refuse_without_file(self, BatchSettings, self.program, "batch")
         return read_batch(Path(self.program))
 
     def verify(self) -> None:
@@ -727,9 +727,10 @@ class ServedSettings(ProgramSettings):
         """The program's file.
 
         Raises:
-            SettingsError: It is missing or damaged.
+            SettingsError: No file was named (plain ``subprocess``), or it is missing or damaged.
         """
-        check_described(self, ServedSettings, self.command, "subprocess")
+        # a named file gives the settings a class of their own; this class itself means that none was named
+        refuse_without_file(self, ServedSettings, self.command, "subprocess")
         return read_served(Path(self.command))
 
     def verify(self) -> None:
@@ -737,7 +738,7 @@ class ServedSettings(ProgramSettings):
         self.document().check("subprocess")
 
 
-def check_described(settings: Settings, base: type[Settings], file: str, kind: str) -> None:
+def refuse_without_file(settings: Settings, base: type[Settings], file: str, kind: str) -> None:
     """Refuse settings that know nothing of their file: it was not named behind the tracker's id.
 
     Raises:

@@ -121,12 +121,12 @@ NO_INPAINTING = "background inpainting is left out: it rejects nothing"
 SPECS = (
     # The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), with depth
     # and without: no dynamic handling beyond the robust kernel and the chi-square tests of the pose
-    # optimiser.
+    # optimiser. `system_spec` gives every entry the factory `composition.build`.
     system_spec(
         "orb-slam2",
         "ORB-SLAM2 style (our back end)",
-        (),
-        {},
+        filters=(),
+        groups={},
         base=UnfilteredSystemSettings,
         summary="the shared RGB-D back end without dynamic handling: the reference of every ratio",
         provenance="own",
@@ -142,8 +142,8 @@ SPECS = (
     system_spec(
         "orb-slam2-mono",
         "ORB-SLAM2 style, monocular (our back end)",
-        (),
-        {"backend": MonocularBackendSettings()},
+        filters=(),
+        groups={"backend": MonocularBackendSettings()},
         base=UnfilteredSystemSettings,
         summary="the shared back end without depth and without dynamic handling",
         sensors="rgb",
