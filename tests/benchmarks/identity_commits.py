@@ -3,7 +3,10 @@
     python tests/benchmarks/identity_commits.py --last 300 --upto 62446da7
 
 Of each commit the sources are read from git; nothing is run. Edges that were cut later (`CUT`) are
-left out in older commits, too, so that the figure says what today's structure would have cost.
+left out in older commits, too, so that the figure says what today's structure would have cost. Of
+the 300 commits up to 62446da7, 62 change `orb-slam2` and 39 `never-move`; with the imports as these
+commits have them it is 98 and 43. What `never-move` gains is the import of `runs.process.child` by
+`runs.loop` alone.
 """
 
 import argparse
