@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from functools import partial
@@ -194,7 +194,6 @@ def run(
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
-    announce_recordings(sequences, camera)
     # one specification for each sequence, seed and offset
     specs = make_specs(
         tracker,
@@ -226,19 +225,19 @@ def run(
     make_runs = partial(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
-    make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
+    pictures = runs.requested_files(specs[0])
+    make_and_show(make_runs, results, jobs, scored_under, yes, pictures, folders=sequences)
 
 
-def announce_recordings(sequences: list[str], camera: str | None) -> None:
-    """Say what the folders among the sequences are taken for; one that cannot be opened is reported with its run."""
+def announce_recording(sequence: str, camera: str | None) -> None:
+    """Say what a folder is taken for; nothing of a sequence that is named by an id."""
     from dynslam_bench.sequences import open_sequence
 
-    for name in sequences:
-        if not Path(name).expanduser().is_dir():
-            continue
-        with suppress(DynslamError):
-            for line in getattr(open_sequence(name, camera=camera), "taken_for", ()):
-                announce(line)
+    if not Path(sequence).expanduser().is_dir():
+        return
+    with suppress(DynslamError):
+        for line in getattr(open_sequence(sequence, camera=camera), "taken_for", ()):
+            announce(line)
 
 
 def default_protocol(tracker: str) -> str:
@@ -361,6 +360,7 @@ def make_and_show(
     protocol: str,
     yes: bool,
     pictures: Sequence[str] = (),
+    folders: Iterable[str] = (),
 ) -> None:
     """Make runs, show them with their files and what is to be said of them, and end with the exit code.
 
@@ -371,6 +371,7 @@ def make_and_show(
         protocol: How their errors are evaluated.
         yes: Download the network for masks without asking.
         pictures: Names of the files, maps included, that were asked for beside each run.
+        folders: Sequences of which it is said, when their first run begins, what they are taken for.
 
     Raises:
         Exit: With 1 if none of the runs can be made; with 3 if some failed, were lost, cannot be
@@ -380,7 +381,7 @@ def make_and_show(
 
     # make them, with a bar
     store = runs.RunStore(results)
-    watched = WatchedRuns(store, jobs, protocol)
+    watched = WatchedRuns(store, jobs, protocol, folders)
     made = make_with_network(watched, make_runs, yes)
     if watched.faults and not made:
         raise typer.Exit(1)
@@ -465,6 +466,7 @@ class WatchedRuns:
         store: Where the runs are stored.
         jobs: Runs at a time.
         protocol: How their errors are evaluated.
+        folders: Sequences of which it is said, when their first run begins, what they are taken for.
 
     Attributes:
         opened: Sequence, data root and camera that were asked for, by the runs' ids.
@@ -472,8 +474,11 @@ class WatchedRuns:
         faults: Messages of the runs that cannot be made, each of them written once.
     """
 
-    def __init__(self, store: runs.RunStore, jobs: int, protocol: str) -> None:
+    def __init__(
+        self, store: runs.RunStore, jobs: int, protocol: str, folders: Iterable[str] = ()
+    ) -> None:
         self.store = store
+        self._to_announce = set(folders)
         self.jobs = jobs
         self.protocol = protocol
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
@@ -514,6 +519,11 @@ class WatchedRuns:
 
     def _event(self, event: runs.RunEvent) -> None:
         """Count the frames that are tracked, of all that the runs have."""
+        spec = event.spec
+        if event.kind == "started" and spec.sequence in self._to_announce:
+            self._to_announce.remove(spec.sequence)
+            announce_recording(spec.sequence, spec.camera)
+
         if event.record is not None:
             self._running.pop(event.run_id, None)
             if event.kind == "finished":

@@ -1,5 +1,6 @@
 """What of a results folder is locked, removed, full or killed in the middle: one line, and the same command goes on."""
 
+import os
 import shutil
 import sqlite3
 import warnings
@@ -328,9 +329,11 @@ def test_a_file_that_vanishes_before_it_is_opened_is_one_line(
 ) -> None:
     record = three.all()[0][0]
     is_file = Path.is_file
+    isfile = os.path.isfile
     for path in three.root.rglob(file):
         path.unlink()
     monkeypatch.setattr(Path, "is_file", lambda path: path.name == file or is_file(path))
+    monkeypatch.setattr(os.path, "isfile", lambda path: Path(path).name == file or isfile(path))
     with pytest.raises(RunError, match=f"cannot read .*{file}"):
         three.changed(record)
     assert f"cannot read {three.root}" in three.score(record).reasons["final"]
