@@ -131,6 +131,8 @@ BRISK = {
 """Depth is compared with keyframes from the second one on."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES |= {
+    # a narrow image is enlarged: it has more corners than features, whatever the threshold
+    "features.fast_threshold": ("orb-slam2", {"features.n_features": 3000}),
     "backend.mapping.neighbours": ("orb-slam2", MANY),
     "backend.bundle_adjustment.fixed": ("orb-slam2", {**MANY, "backend.bundle_adjustment.window": 2}),
     "backend.bundle_adjustment.observations": ("orb-slam2", MANY),
