@@ -151,16 +151,16 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
         - state: ``complete``, ``pruned``, ``fail``, ``running``, ``waiting``;
         - reason: why it was pruned or failed; missing else;
         - earlier: the study that it was taken from, and whether its code was another; missing for
-          the study's own trials.
+            the study's own trials.
 
         ``boolean`` column feasible: all constraints hold; missing for incomplete trials.
 
         ``Float64`` columns:
 
         - one for each objective, named after ``value_``, as Optuna has them: natural logarithms of
-          ratios to the baseline, less is better;
+            ratios to the baseline, less is better;
         - ratio: the ATE ratio, below 1 is better than the baseline; missing if accuracy is no
-          objective;
+            objective;
         - coverage: share, 0 to 1;
         - fps: frames a second;
         - duration_s: seconds from the start of the trial to its end.

@@ -303,7 +303,7 @@ class Board:
             ``string`` columns:
 
             - run_id, frames, split, repeat, status, segmentation, protocol_id, protocol_digest,
-              provenance, tracker, label;
+                provenance, tracker, label;
             - kind: ``run here`` or ``imported``;
             - settings: what sets the variant apart, ``name=value; ...``;
             - sequence: name of the column in tables; column_id: its key;
@@ -312,7 +312,7 @@ class Board:
             - trajectory: ``online`` or ``final``, whose errors they are;
             - computer: where the times were taken;
             - program_remark: how many programs share the row, or how the results differ from those
-              of the program that ranks.
+                of the program that ranks.
 
             ``Int64`` columns: seed, offset, noise (missing for the sequence's own), n_frames,
             n_processed, n_tracked.
@@ -327,14 +327,14 @@ class Board:
 
             - coverage and epipolar_skipped: shares, 0 to 1;
             - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
-              or worse;
+                or worse;
             - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
             - frame_ms: median, milliseconds;
             - real_time_factor; peak_memory_mb: MB; mask_iou: 0 to 1;
             - rotation_uncertainty_deg: standard error in degrees of the alignment's rotation; above
-              10 the metrics ``ape_rot_*`` say nothing of the tracker;
+                10 the metrics ``ape_rot_*`` say nothing of the tracker;
             - every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
-              ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+                ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
         """
         # column to its type: those that all frames have, then the metrics
         metrics = sorted(
