@@ -110,9 +110,9 @@ def outcome(
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
 
-    # errors, those of a static camera where nothing was tracked
+    # errors, those of a static camera where nothing was tracked; a batch program has a final trajectory alone
     metrics = score(store, record, protocol)
-    evaluation = metrics.online
+    evaluation = metrics.online if record.tracker.online else metrics.final
     if evaluation is None:
         ate_m = static_camera_m(instance, data_root)
         rpe_m = static_camera_rpe_m(instance, protocol, data_root)

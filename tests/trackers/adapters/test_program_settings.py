@@ -632,3 +632,20 @@ def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path, toy_fo
     assert "nothing that the study set has an effect" in summary.conclusion
     assert "All 3 trials" in summary.conclusion
     assert summary.best is None or summary.best.evidence is None, "nothing was left to judge"
+
+
+@pytest.mark.slow
+def test_a_study_of_a_batch_program_compares_final_trajectories(slam, tmp_path, toy_folder):
+    """A batch program has no others: its runs are no lost ones."""
+    study = {
+        "name": "final",
+        "tracker": slam(code=WRITES),
+        "tune": [f"{toy_folder}[0:10]?offsets=0-1"],
+        "recorded": [],
+        "offsets": [0],
+        "trials": 4,
+        "space": {"include": ["tracking.radius"], "fixed": {"viewer": "on"}},
+    }
+    tuner = Study(results=tmp_path / "results", **study).run()
+    ratios = {trial.value for trial in tuner.study.trials}
+    assert len(ratios) == 4, "each step length has an error of its own"
