@@ -34,8 +34,11 @@ def test_plots_of_optuna_are_drawn_or_left_out():
         lambda trial: trial.suggest_float("a", 0, 1) + trial.suggest_int("b", 0, 3), n_trials=5
     )
     plots = optuna.visualization
-    for plot in (plots.plot_optimization_history, plots.plot_param_importances, plots.plot_edf):
+    for plot in (plots.plot_optimization_history, plots.plot_edf):
         assert still(plot(study)).startswith(PICTURE), plot.__name__
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    importances = plots.plot_param_importances(study, evaluator=evaluator)
+    assert still(importances).startswith(PICTURE)
     # several panels, and areas
     assert still(plots.plot_slice(study)) == ""
     assert still(plots.plot_contour(study)) == ""
