@@ -149,7 +149,7 @@ def _board_row(opened: RoundFolder, entry: str, rows: list[ScoredRow]) -> BoardR
 def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
     """What holds for all rows."""
     of = opened.round
-    late = [name for name in opened.entry_names() if name not in opened.reveal.entries]
+    late = opened.late_entries()
     remarks = [
         f"Sealed: {of.scenes} scenes of each of {', '.join(of.families)}, {of.frames} frames; "
         f"the salt's SHA-256 {of.salt_sha256[:16]} was published before, the salt at {opened.reveal.revealed}.",

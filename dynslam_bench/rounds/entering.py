@@ -13,6 +13,7 @@ from dynslam_bench.rounds.bits import check_bits
 from dynslam_bench.rounds.files import (
     PLAIN_NAME,
     Entry,
+    Program,
     RoundFolder,
     Trial,
     open_round,
@@ -70,13 +71,15 @@ def enter(
         on_step("running it on a public scene")
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
+    program = program_of(record.identity)
+    _check_new(opened, tracker, program)
     entry = Entry(
         name=name,
         round_sha256=opened.sha256,
         protocol=opened.round.protocol,
         tracker=tracker,
         overrides=overrides,
-        program=program_of(record.identity),
+        program=program,
         checks=checks,
         trial=trial,
         entered=stamp(now),
@@ -111,6 +114,20 @@ def _check_open(opened: RoundFolder, name: str, now: datetime) -> None:
             f"there is an entry '{name}' already",
             f"remove {opened.entry_file(name)} to enter again, or name another",
         )
+
+
+def _check_new(opened: RoundFolder, tracker: str, program: Program) -> None:
+    """Check that no entry has the same program: the two would share their runs.
+
+    Raises:
+        RunError: There is such an entry.
+    """
+    for name in opened.entry_names():
+        other = opened.read_entry(name)
+        if other.tracker == tracker and other.program == program:
+            raise RunError(
+                f"entry '{name}' is the same tracker with the same settings", "enter it once"
+            )
 
 
 def _checked(tracker: str, settings: dict[str, Any]) -> list[str]:

@@ -341,6 +341,17 @@ class RoundFolder:
         self._check_round(entry.round_sha256, f"entry '{name}'")
         return entry
 
+    def late_entries(self) -> list[str]:
+        """Names of the entries that lie in the folder and that the reveal does not list."""
+        return [name for name in self.entry_names() if name not in self.reveal.entries]
+
+    def late_words(self, name: str) -> str:
+        """Why an entry that the reveal does not list is not run."""
+        return (
+            f"entry '{name}' is not listed in {REVEAL_FILE}: "
+            f"it came after the reveal of {self.reveal.revealed}"
+        )
+
     def received_entry(self, name: str) -> Entry:
         """An entry that was received in time, unchanged since.
 
@@ -350,8 +361,7 @@ class RoundFolder:
         stated = self.reveal.entries.get(name)
         if stated is None:
             raise RunError(
-                f"entry '{name}' is not listed in {REVEAL_FILE}: it came after the reveal of {self.reveal.revealed}",
-                f"listed: {', '.join(self.reveal.entries) or 'none'}",
+                self.late_words(name), f"listed: {', '.join(self.reveal.entries) or 'none'}"
             )
         file = self.entry_file(name)
         if not file.is_file():

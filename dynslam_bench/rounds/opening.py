@@ -87,4 +87,6 @@ def new_round(
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
             file.write(salt.hex() + "\n")
     write_atomic(root / ROUND_FILE, made.to_json())
+    # what can be computed again at any time is no part of a repository
+    write_atomic(root / ".gitignore", "index.sqlite\nreport/\n.*.claim\n.merging\n")
     return made

@@ -88,6 +88,8 @@ def run(
             refused: dict[str, str] = {}
         else:
             usable, refused = usable_entries(opened)
+            for name in opened.late_entries():
+                refused[name] = opened.late_words(name)
     pairs = [(entry, sequence) for sequence in opened.sequences for entry in usable]
     made = make_rows(
         opened, by, pairs, results=results, jobs=jobs, on_step=on_step, on_event=on_event
@@ -112,7 +114,7 @@ def usable_entries(opened: RoundFolder) -> tuple[list[Entry], dict[str, str]]:
     """The listed entries whose trackers are here and unchanged; and why the others are not used, by name."""
     usable = []
     refused = {}
-    for name in sorted({*opened.reveal.entries, *opened.entry_names()}):
+    for name in opened.reveal.entries:
         try:
             usable.append(usable_entry(opened, name))
         except DynslamError as error:
@@ -192,8 +194,8 @@ def make_rows(
 
     # the bank, and which rows it holds: those of earlier calls, too
     folder = opened.bank(by)
-    if rows:
-        bank.add([store.root], folder)
+    left_out = bank.add([store.root], folder).left_out
+    failed += [f"left out of the bank: {entry.path}: {entry.reason}" for entry in left_out]
     results_here = _described(opened, by, digests, rows)
     write_atomic(folder / RESULTS_FILE, results_here.to_json())
     return RoundRuns(results_here, folder, rows, failed)

@@ -115,6 +115,8 @@ def verify(
 
     # a sample, run again here
     pairs = _sample(found.rows, usable, sample)
+    if not pairs:
+        return found
     chosen = list(dict.fromkeys((entry.name, row.row.sequence) for entry, row in pairs))
     by_name = {entry.name: entry for entry in usable}
     again = make_rows(
