@@ -215,7 +215,7 @@ class Reveal(RoundRecord):
     """
 
     round_sha256: Sha256
-    salt: Sha256
+    salt: str
     entries: dict[Name, Sha256]
     revealed: str
 

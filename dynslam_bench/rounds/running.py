@@ -194,10 +194,11 @@ def make_rows(
 
     # the bank, and which rows it holds: those of earlier calls, too
     folder = opened.bank(by)
-    left_out = bank.add([store.root], folder).left_out
-    failed += [f"left out of the bank: {entry.path}: {entry.reason}" for entry in left_out]
     results_here = _described(opened, by, digests, rows)
-    write_atomic(folder / RESULTS_FILE, results_here.to_json())
+    if rows:
+        left_out = bank.add([store.root], folder).left_out
+        failed += [f"left out of the bank: {entry.path}: {entry.reason}" for entry in left_out]
+        write_atomic(folder / RESULTS_FILE, results_here.to_json())
     return RoundRuns(results_here, folder, rows, failed)
 
 
