@@ -13,8 +13,8 @@ from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
     FLOOR_M,
+    ComparisonVerdict,
     PairedRatio,
-    Verdict,
     findings,
     paired_ratio,
     verdict_of,
@@ -55,7 +55,7 @@ class Comparison:
     """
 
     overall: dict[str, PairedRatio]
-    verdicts: dict[str, Verdict]
+    verdicts: dict[str, ComparisonVerdict]
     findings: dict[str, list[str]]
     table: Table
     only_a: int

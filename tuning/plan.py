@@ -191,7 +191,7 @@ class Preview(Record):
         return lines
 
 
-class Plan:
+class StudyPlan:
     """A study resolved before it runs: trackers, baseline, search space, instances.
 
     Nothing runs, and nothing is stored.

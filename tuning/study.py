@@ -55,7 +55,7 @@ from dynslam_bench.tuning.objectives import (
     outcome,
     own_objective,
 )
-from dynslam_bench.tuning.plan import Plan, design_of
+from dynslam_bench.tuning.plan import StudyPlan, design_of
 from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
@@ -139,7 +139,7 @@ class Evaluation:
     values: list[float] | None = None
 
 
-class Study(Plan):
+class Study(StudyPlan):
     """A study to be run: at once, or trial by trial with `ask`, `evaluate` and `tell`.
 
     Example:

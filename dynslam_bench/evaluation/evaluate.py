@@ -24,7 +24,7 @@ from dynslam_bench.evaluation.comparison import (
 from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
-from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory, load_trajectory
 
 SCHEMA_VERSION = 1
 METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
@@ -194,7 +194,7 @@ def evaluate_files(
 
 
 def evaluate_loaded(
-    estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str
+    estimate: LoadedTrajectory, ground_truth: LoadedTrajectory, protocol: Protocol | str
 ) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 

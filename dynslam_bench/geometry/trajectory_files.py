@@ -90,7 +90,7 @@ class FileNotes:
 
 
 @dataclass(frozen=True, eq=False)
-class TumFile:
+class LoadedTrajectory:
     """A trajectory and the notes on the file it came from, TUM's or KITTI's.
 
     Attributes:
@@ -121,7 +121,7 @@ def read_tum(path: str | Path) -> Trajectory:
     return load_tum(path).trajectory
 
 
-def load_tum(path: str | Path) -> TumFile:
+def load_tum(path: str | Path) -> LoadedTrajectory:
     """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
 
     Raises:
@@ -254,7 +254,7 @@ def _joined(headings: list[Heading]) -> Heading | None:
 
 def ordered_file(
     ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes
-) -> TumFile:
+) -> LoadedTrajectory:
     """Poses in the order of their stamps, with the counts of sorted and replaced lines.
 
     Args:
@@ -278,7 +278,7 @@ def ordered_file(
         every_line.T_world_cam[last_of_stamp],
         exact[last_of_stamp],
     )
-    return TumFile(trajectory, notes, every_line if notes.duplicates else None)
+    return LoadedTrajectory(trajectory, notes, every_line if notes.duplicates else None)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:
@@ -472,7 +472,7 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
     return _load_kitti(Path(path), Path(times)).trajectory
 
 
-def _load_kitti(path: Path, times: Path) -> TumFile:
+def _load_kitti(path: Path, times: Path) -> LoadedTrajectory:
     """The camera-to-world trajectory of a KITTI pose file and its stamps, with notes on both."""
     # rigid poses, whose rotations are made orthonormal
     rows = read_table(path, 12, _KITTI_COLUMNS)
@@ -489,7 +489,7 @@ def _load_kitti(path: Path, times: Path) -> TumFile:
     ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-    return TumFile(
+    return LoadedTrajectory(
         Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note)
     )
 
@@ -512,7 +512,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
 # in another file.
 
 
-def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> TumFile:
+def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> LoadedTrajectory:
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:

@@ -75,7 +75,7 @@ class RunEvent:
 
 
 @dataclass
-class Plan:
+class PlannedRuns:
     """Runs and frames that a call of `run_many` is to make.
 
     Attributes:
@@ -94,7 +94,7 @@ def run_many(
     jobs: int = 1,
     executor: Executor | None = None,
     retry: Collection[str] = (),
-    on_plan: Callable[[Plan], None] | None = None,
+    on_plan: Callable[[PlannedRuns], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
@@ -168,7 +168,7 @@ class _ManyRuns:
     store: RunStore
     protocol: Protocol
     jobs: int
-    on_plan: Callable[[Plan], None] | None
+    on_plan: Callable[[PlannedRuns], None] | None
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
     cancelled: Callable[[], bool]
@@ -193,7 +193,7 @@ class _ManyRuns:
         """
         resolver = Resolver()
         stored_runs = LookUp(self.store)
-        plan = Plan()
+        plan = PlannedRuns()
         looked_up: set[str] = set()
         for spec in specs:
             run = self._resolve(resolver, spec)

@@ -42,7 +42,7 @@ FIELDS = (
 """Names of the values of a list's row, in order."""
 
 
-def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
+def make_run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
     """A run's row in a list: JSON values under the names `FIELDS`.
 
     Args:
@@ -212,7 +212,7 @@ def _cells(record: RunRecord, metrics: MetricRecord | None) -> Row:
     # columns of the same name as a field of the record, then those of the list, then the others
     columns = (*_INTEGER_COLUMNS, *_FLOAT_COLUMNS, *_TEXT_COLUMNS)
     cells = {name: getattr(record, name) for name in columns if hasattr(record, name)}
-    cells |= run_row(record, metrics)
+    cells |= make_run_row(record, metrics)
     cells["label"] = record.tracker.label or record.tracker.id
     cells["provenance"] = record.tracker.provenance
     cells["split"] = record.sequence.split

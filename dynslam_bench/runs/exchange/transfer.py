@@ -23,8 +23,8 @@ from dynslam_bench.envs.slam_env import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint
 from dynslam_bench.geometry import (
     Array,
+    LoadedTrajectory,
     Trajectory,
-    TumFile,
     associate,
     nearest_gap,
     to_seconds,
@@ -538,7 +538,7 @@ def _reference_by_images(opened: Sequence) -> _Reference:
     )
 
 
-def _reference_by_truth(sequence: str, truth: TumFile) -> _Reference:
+def _reference_by_truth(sequence: str, truth: LoadedTrajectory) -> _Reference:
     """A sequence of which only the ground truth is here."""
     poses = truth.poses(repeats=True)
     part = _part_by_truth(sequence, poses)
