@@ -85,7 +85,7 @@ class RunResult:
 
     @property
     def remarks(self) -> list[str]:
-        """What to know before the metrics are believed, a line each: warnings and hints."""
+        """Warnings and hints on the metrics, one a line."""
         return self.store.score(self.record, self.protocol).remarks
 
     @property

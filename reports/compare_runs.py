@@ -243,7 +243,7 @@ def _write_page(
 def _board_data(
     cells: Mapping[str, Mapping[str, TrackerOnSequence]], evaluated: str, paged: Collection[str]
 ) -> dict[str, Any]:
-    """What ``data/board.js`` holds, see `html.board_page.board_data`; of every cell the typical run is listed.
+    """Content of ``data/board.js``, see `html.board_page.board_data`; of every cell the typical run is listed.
 
     Args:
         cells: Label to sequence to cell, A and B of each tracker after each other.

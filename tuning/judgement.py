@@ -390,7 +390,7 @@ def _extend_command(scenes_more: int) -> str:
 def next_step(
     spec: StudySpec, summary: StudySummary, baseline: Configuration, best: Configuration
 ) -> tuple[str, str]:
-    """What to do after a study: a sentence, and the command that does it.
+    """The next step after a study: a sentence, and the command that does it.
 
     Args:
         spec: The study.
@@ -450,7 +450,7 @@ def families_sentence(design: Design) -> str:
 def beyond_families(
     comparison: PairedRatio, ratios: Mapping[str, float], design: Design
 ) -> PairedRatio | None:
-    """What the judging families that no trial saw say of others: each counts once, by the mean of its scenes.
+    """Comparison by the judging families that no trial saw: each counts once, by the mean of its scenes.
 
     Scenes that a side lost take no part in the means; a family of which one side alone lost half of the scenes or
     more is lost by it.

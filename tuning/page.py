@@ -460,7 +460,7 @@ def fewer_starts(design: Design) -> str:
 
 
 def warnings_of(tuner: Study) -> list[str]:
-    """What a reader of the course should know, in sentences."""
+    """Warnings on the course of a study, in sentences."""
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     infeasible = sum(not is_feasible(trial) for trial in complete)
     notes = []

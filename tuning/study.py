@@ -663,7 +663,7 @@ class Study(StudyPlan):
         return any(trial.user_attrs.get("worker") != worker_name() for trial in running)
 
     def _beginnings(self) -> Iterator[FrozenTrial | dict[str, Scalar]]:
-        """What a new study knows of earlier ones (trials), and what it tries after its baseline (settings)."""
+        """Trials of earlier studies that a new one knows, and settings that it tries after its baseline."""
         for entry in self.spec.start:
             if isinstance(entry, str) and Path(entry).expanduser().is_dir():
                 yield from self._earlier(Path(entry).expanduser())

@@ -483,7 +483,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    """Lines below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")

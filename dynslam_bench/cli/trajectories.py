@@ -175,7 +175,7 @@ def scored_with_hints(
 
 
 def remarks(result: Evaluation, likely: tuple[Hint, ...]) -> list[str]:
-    """What a reader of the numbers needs to know, a line each."""
+    """Diagnostics, warnings and hints on an evaluation, one a line."""
     return [
         *result.diagnostics,
         *(f"warning: {line}" for line in result.warnings),

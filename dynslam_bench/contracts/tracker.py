@@ -38,7 +38,7 @@ class Tracker(Protocol):
 
 @dataclass(frozen=True)
 class TrackerContext:
-    """What a tracker may be told of where it runs; never the ground-truth poses.
+    """Facts of the run that a tracker may use; never the ground-truth poses.
 
     Attributes:
         sequence_id: Id of the sequence, for presets and `segmentation.source = auto`.

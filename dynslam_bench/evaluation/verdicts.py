@@ -1,4 +1,4 @@
-"""What paired errors show: the typical ratio of a candidate to a baseline, its losses, and a verdict.
+"""Statistics of paired errors: the typical ratio of a candidate to a baseline, its losses, and a verdict.
 
 All statistics are over scenes. A scene has one value: the natural logarithm of the candidate's error over
 the baseline's, below 0 is better. Errors of a few scenes may be huge, so nothing here is a mean of errors:
@@ -394,7 +394,7 @@ def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> ComparisonVer
 def findings(
     comparison: PairedRatio, subject: str = "the candidate", margin: float = MARGIN
 ) -> list[str]:
-    """What a comparison found, in short sentences without their full stops: claim, exclusion, every loss.
+    """Findings of a comparison in short sentences without full stops: claim, exclusion, every loss.
 
     Args:
         comparison: The candidate beside the baseline.

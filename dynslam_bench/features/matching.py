@@ -354,7 +354,7 @@ def rotation_consistent(
     bins: int = 30,
     share: float = 0.1,
 ) -> NDArray[np.bool_]:
-    """Which matches agree with the rotation in the image plane that most matches show.
+    """Flag matches that agree with the rotation in the image plane that most matches show.
 
     Args:
         angle_a: Keypoint orientations in the one image, degrees ``[N]``.

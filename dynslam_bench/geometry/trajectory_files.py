@@ -28,7 +28,7 @@ from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
 _TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-"""What stands in a line of TUM's format."""
+"""Columns of a line in TUM's format."""
 MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
@@ -435,7 +435,7 @@ def is_number(text: str) -> bool:
 
 
 def _hint(parts: list[str]) -> str:
-    """Which other format a line of another length is of; empty where that is not known."""
+    """Name the format that a line of another length is of; empty where that is not known."""
     if len(parts) == 12:
         return "12 values a line are KITTI's format: `eval` and `import` take its stamps with --timestamps FILE"
     if len(parts) in (15, 16):  # the stamp may be a whole number
@@ -451,7 +451,7 @@ def _hint(parts: list[str]) -> str:
 # numbers a line.
 
 _KITTI_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
-"""What stands in a line of KITTI's format."""
+"""Columns of a line in KITTI's format: a 3x4 matrix row by row."""
 
 
 def read_kitti(path: str | Path, times: str | Path) -> Trajectory:

@@ -382,7 +382,7 @@ class _ManyRuns:
 
 
 def _answer_of(ask: Callable[..., T], *arguments: object) -> T:
-    """What an executor answers; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
+    """Call an executor; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
     try:
         return ask(*arguments)
     except DynslamError:

@@ -83,7 +83,7 @@ def make_run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
 
 
 def _remarks(record: RunRecord, metrics: MetricRecord | None) -> list[str]:
-    """What to know before the numbers are believed: of the recording, then of the errors."""
+    """Warnings on the recording, then remarks on the errors, one a line."""
     of_recording = [f"warning: {note}" for note in record.notes if note.startswith(ON_RECORDING)]
     return [*of_recording, *([] if metrics is None else metrics.remarks)]
 
@@ -106,7 +106,7 @@ def _reason(record: RunRecord, metrics: MetricRecord | None) -> str:
 
 
 def part_words(record: RunRecord) -> str:
-    """Which frames of its sequence a run was asked for, e.g. ``0:60, every 2nd``; empty for all of them."""
+    """Part of its sequence that a run was asked for, e.g. ``0:60, every 2nd``; empty for all frames."""
     words = []
     if record.frames is not None:
         start, stop = record.frames

@@ -1,4 +1,4 @@
-"""What a store keeps of the sequences: stamps and ground truth of each part, by which runs are scored again.
+"""Parts of sequences that a store keeps: stamps and ground truth of each part, by which runs are scored again.
 
 The images are not needed for that.
 """

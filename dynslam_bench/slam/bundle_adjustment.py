@@ -44,7 +44,7 @@ DAMPING = 1e-5
 LEAST_DAMPING = 1e-8
 """Steps that reduce the cost lower the damping down to this."""
 DAMPING_FLOOR = 1e-9
-"""What the diagonal grows by in any case, so that directions without any information can be solved for."""
+"""Least addition to the diagonal, so that directions without any information can be solved for."""
 CONVERGED_GAIN = 1e-5
 """The optimisation ends when a step reduces the cost by less than this share."""
 MIN_DETERMINANT = 1e-18

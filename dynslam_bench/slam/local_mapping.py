@@ -447,7 +447,7 @@ def established_points(slam_map: Map, keyframe: int) -> int:
 
 
 def share_in_view(slam_map: Map, keyframe: int, T_cam_world: Array) -> float:
-    """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
+    """Share of a keyframe's points that lies in another camera's image; 1 if it has none."""
     points = slam_map.kf_point[keyframe]
     position = slam_map.position[points[points >= 0]]
     _, inside = slam_map.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])

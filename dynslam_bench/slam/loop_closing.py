@@ -688,7 +688,7 @@ def edges_within(ids: Slots, edges: Sequence[Edge]) -> list[Edge]:
 
 
 def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: float) -> Array:
-    """What lengths at each keyframe are to be multiplied by, so that a loop edge's scale is met.
+    """Factors for the lengths at each keyframe with which a loop edge's scale is met.
 
     Logarithms of scales are to be equal at both ends of an edge, and to differ by that of `scale`
     at the loop edge's. The sum of squared errors is least. Strasdat, Montiel and Davison (Scale

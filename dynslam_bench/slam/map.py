@@ -458,7 +458,7 @@ class Map:
     # ------------------------------------------------------------------ views
 
     def project(self, T_cam_world: Array, candidates: Slots) -> VisiblePoints:
-        """Which of the candidate points a camera should see, and where.
+        """Project candidate points: those that a camera should see, and where.
 
         Args:
             T_cam_world: World-to-camera pose ``[4, 4]``.
@@ -497,7 +497,7 @@ class Map:
 
 
 MapView: TypeAlias = tuple[tuple[KeyframeView, ...], tuple[Slots, Array]]
-"""What filters may read of the map: the newest keyframes, newest first, at most `VIEWS`; ids ``[M]`` and world
+"""The map as filters may read it: the newest keyframes, newest first, at most `VIEWS`; ids ``[M]`` and world
 positions ``[M, 3]`` in metres of all points."""
 
 

@@ -294,7 +294,7 @@ class SlamPipeline:
     def _cull(
         self, frame: FrameBundle, state: FilterState, clock: StageClock
     ) -> tuple[FilterResult, Any]:
-        """Which keypoints are static, by all filters in order; the first that needs the flow starts it.
+        """Judge which keypoints are static, by all filters in order; the first that needs the flow starts it.
 
         Returns:
             The filters' common verdict. Its stats are every filter's, each name with the filter's

@@ -91,8 +91,8 @@ MAX_SPLIT_SPREAD = 0.01
 ALIASING_CANDIDATES = 12
 """Best-ranked keyframes of each submap that are tested for aliasing."""
 ALIASING_SHARE = 0.33
-"""What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
-repeated walls 0.4 to 1 (rendered buildings)."""
+"""Share of the first place's matches from which a second place looks like it, too. Without repetition it is 0.15 at
+most, with repeated walls 0.4 to 1 (rendered buildings)."""
 SAME_PLACE_DEPTHS = 0.3
 """Poses farther apart, in median depths of what is seen, are two places."""
 SAME_PLACE_ANGLE = np.radians(15.0)

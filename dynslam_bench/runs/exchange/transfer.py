@@ -298,7 +298,7 @@ class Provenance(Record):
 
 
 def stated_provenance(file: Path) -> str:
-    """What ``provenance.json`` beside a trajectory says of it; empty where there is none, or the file has changed.
+    """Provenance stated in ``provenance.json`` beside a trajectory; empty where there is none, or the file has changed.
 
     Args:
         file: The trajectory, or the folder that holds it.
@@ -561,7 +561,7 @@ def _part_by_truth(sequence: str, truth: Trajectory) -> SequencePart:
 
 
 def _info_by_truth(part: SequencePart, truth: Trajectory, name: str) -> SequenceInfo:
-    """What is known of a sequence without its images: the catalogue's entry and the camera's motion.
+    """Describe a sequence without its images: the catalogue's entry and the camera's motion.
 
     Args:
         part: The whole sequence.

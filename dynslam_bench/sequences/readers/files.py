@@ -1,4 +1,4 @@
-"""What readers are made of: lists of images and counts of what was not used, YAML, CSV, poses of a body."""
+"""Parts of readers: lists of images and counts of what was not used, YAML, CSV, poses of a body."""
 
 import math
 import os
@@ -504,7 +504,7 @@ def size_of_first(folder: Path, images: ImageList) -> tuple[int, int]:
 MOST_BYTES = 1 << 16
 """A calibration has a few kilobytes."""
 MOST_BRACKETS = 1000
-"""What opens more takes yaml's parser minutes."""
+"""Most brackets of a file that is parsed: yaml's parser takes minutes for more."""
 
 
 def read_yaml(path: Path) -> Mapping[str, Any]:
