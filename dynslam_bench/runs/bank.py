@@ -284,7 +284,7 @@ def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
 
 
 def _faults_of_run(store: Bank, record: RunRecord, listed: Collection[str]) -> list[str]:
-    """What is wrong with a run whose record can be read.
+    """Faults of a run whose record can be read.
 
     Args:
         store: The bank.

@@ -42,7 +42,7 @@ _OPTIONS = {
     "frames": (1, MAX_FRAMES),
     "noise": (0, 999_999_999),
 }
-"""What may stand behind the question mark, with the least and the largest value."""
+"""Options behind the question mark of an id, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
 
