@@ -79,7 +79,7 @@ def test_scenes_come_from_salt_name_family_and_index(tmp_path: Path) -> None:
     sequences = opened.round.sequences(SALT)
     assert len(set(sequences)) == 4
     parsed = [parse_synthetic_id(sequence) for sequence in sequences]
-    assert [(each.name, each.frames, each.split) for each in parsed] == [
+    assert [(scene.name, scene.frames, scene.split) for scene in parsed] == [
         ("walking_xyz", 6, "held-out"),
         ("walking_xyz", 6, "held-out"),
         ("crowd_xyz", 6, "held-out"),
@@ -300,9 +300,9 @@ def first_machine(root: Path) -> None:
 
 def second_machine(root: Path) -> None:
     """A verifier: all is in order, then it is tampered with."""
-    found = rounds.verify(root, by="bob", sample=2)
-    assert found.faults == []
-    assert [again.agreement for again in found.rerun] == ["identical"] * 6
+    verification = rounds.verify(root, by="bob", sample=2)
+    assert verification.faults == []
+    assert [again.agreement for again in verification.rerun] == ["identical"] * 6
     shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     board = rounds.report(root)
     assert "Late, not run: late." in board.remarks
@@ -329,7 +329,7 @@ def row_of(root: Path, entry: str) -> tuple[Path, Path]:
 
 
 def forge(root: Path, run: Path, changed: Path) -> None:
-    """Bring all checksums up to date after a file was changed, as somebody would who hides it."""
+    """Bring all checksums up to date after a file was changed, as a forger would."""
     bank = root / "results" / "alice"
     part = json.loads((run / "run.json").read_text())["sequence"]["part"]
     for file in bank.glob("runs/*/run.json"):
@@ -348,8 +348,10 @@ def changed_trajectory(root: Path) -> None:
     file = run / "trajectory_online.txt"
     before = file.read_text()
     file.write_text(before.replace(" 0 0 0 0", " 0 0.001 0 0", 1) + "# changed\n")
-    found = rounds.verify(root, by="bob", sample=0)
-    assert any("trajectory_online.txt" in fault and run.name in fault for fault in found.faults)
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert any(
+        "trajectory_online.txt" in fault and run.name in fault for fault in verification.faults
+    )
     file.write_text(before)
 
 
@@ -361,8 +363,8 @@ def better_trajectory(root: Path) -> None:
     shutil.copyfile(part / "groundtruth.txt", run / "trajectory_online.txt")
     forge(root, run, run / "trajectory_online.txt")
     assert rounds.verify(root, by="bob", sample=0).ok
-    found = rounds.verify(root, by="bob", sample=2)
-    (fault,) = found.faults
+    verification = rounds.verify(root, by="bob", sample=2)
+    (fault,) = verification.faults
     assert "still on walking_xyz" in fault
     assert "0.00 mm was published, run again it is" in fault
     restore(root, backup)
@@ -375,8 +377,10 @@ def changed_truth(root: Path) -> None:
     shutil.copytree(root / "results" / "alice", backup)
     shutil.copyfile(run / "trajectory_online.txt", part / "groundtruth.txt")
     forge(root, run, part / "groundtruth.txt")
-    found = rounds.verify(root, by="bob", sample=0)
-    assert sum("ground truth is not that of the scene" in fault for fault in found.faults) == 3
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert (
+        sum("ground truth is not that of the scene" in fault for fault in verification.faults) == 3
+    )
     restore(root, backup)
 
 
@@ -402,8 +406,10 @@ def late_entry(root: Path) -> None:
     # rows of an entry that is not listed
     results = root / "results" / "alice" / "results.json"
     results.write_text(results.read_text().replace('"entry": "still"', '"entry": "late"'))
-    found = rounds.verify(root, by="bob", sample=0)
-    assert sum("late on" in fault and "does not list" in fault for fault in found.faults) == 2
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert (
+        sum("late on" in fault and "does not list" in fault for fault in verification.faults) == 2
+    )
 
 
 def played(machine: str, folder: Path) -> None:
