@@ -73,10 +73,10 @@ def enter(
         on_step("running it on a public scene")
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
-    program = program_of(record.identity)
+    program = program_of(name, record.identity)
     if tracker.startswith(_PROGRAMS) and not program.files:
         raise RunError(
-            f"the program of '{tracker}' lies outside of the round's folder: nobody could tell whether it changes",
+            f"the program of '{tracker}' does not lie in entries/{name}: nobody could tell whether it changes",
             f"put its files into {opened.root / 'entries' / name}, and name them from the round's folder",
         )
     check_is_new(opened, tracker, program)

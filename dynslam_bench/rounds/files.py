@@ -159,7 +159,7 @@ class Program(Record):
         settings: All settings by dotted name.
         code: Digest of the code of each part, of the tracker's version and of packages that it needs.
         weights: Digests of the networks.
-        files: Digests of the entrant's own files, below the round's folder or beside the plug-in.
+        files: Digests of the entrant's own files, in ``entries/NAME`` or beside the plug-in.
     """
 
     settings: dict[str, Any]

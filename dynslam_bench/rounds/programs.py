@@ -16,8 +16,9 @@ from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 
 _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 """The part of an absolute path that differs from machine to machine: the round's folder."""
-_OWN_FILES = ("plugin:", "work:")
-"""How names of files begin that lie beside the plug-in or below the round's folder, see `BaseFolders`."""
+_PLUGIN_FILES = "plugin:"
+_ENTRY_FILES = "work:/entries/"
+"""How names of files begin that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
 _VERSION = "its version"
 
 
@@ -32,16 +33,17 @@ def working_in(folder: Path) -> Iterator[None]:
         os.chdir(before)
 
 
-def program_of(identity: Mapping[str, Any]) -> Program:
+def program_of(name: str, identity: Mapping[str, Any]) -> Program:
     """The frozen part of a run's identity.
 
     Args:
+        name: Name of the entry, whose files lie in ``entries/NAME``, or beside the plug-in.
         identity: As a run's record has it, or as `ResolvedRun.stated` gives it before the run: then
             what a plug-in reads is not known yet.
     """
     # the code: of each part, of packages that the tracker needs, its own version
     code = {str(part): str(digest) for part, digest in identity.get("source", {}).items()}
-    code |= {f"package {name}": str(text) for name, text in identity.get("requires", {}).items()}
+    code |= {f"package {top}": str(text) for top, text in identity.get("requires", {}).items()}
     for part in identity.get("parts", ()):
         if is_outside_package(part) and not is_file(part):
             package = module_of(part).partition(".")[0]
@@ -53,9 +55,10 @@ def program_of(identity: Mapping[str, Any]) -> Program:
     reads = identity.get("reads")
     if reads is not None:
         read = Reads.model_validate(reads)
-        for name, digest in {**read.programs, **read.files}.items():
-            if name.startswith(_OWN_FILES) and digest not in (ABSENT, UNREADABLE):
-                files[name] = digest
+        own = (_PLUGIN_FILES, f"{_ENTRY_FILES}{name}/")
+        for file, content in {**read.programs, **read.files}.items():
+            if file.startswith(own) and content not in (ABSENT, UNREADABLE):
+                files[file] = content
     return Program(
         settings=_portable(identity.get("settings", {})),
         code=_portable(code),
@@ -86,7 +89,7 @@ def what_changed(entry: Entry, root: Path, sequence: str) -> str:
     folders = BaseFolders(plugin=resolved.base_folders.plugin, work=root)
     if changed := Verifier().changed(Reads(files=entry.program.files), folders):
         return changed
-    return difference(entry.program, program_of(resolved.stated))
+    return difference(entry.program, program_of(entry.name, resolved.stated))
 
 
 def difference(frozen: Program, now: Program) -> str:

@@ -210,7 +210,7 @@ def _fault_of_row(opened: RoundFolder, by: str, row: Row, sequences: set[str]) -
         return str(error)
     if record.sequence.id != row.sequence:
         return f"its run is on {record.sequence.id}"
-    if changed := difference(entry.program, program_of(record.identity)):
+    if changed := difference(entry.program, program_of(entry.name, record.identity)):
         return f"it was run by another program than entered: {changed} was changed"
 
     # the ground truth needs no rendering
