@@ -114,12 +114,12 @@ class Round(RoundRecord):
         Raises:
             RunError: The renderer, a family or the protocol has another version.
         """
-        here = renderer_versions(self.families)
-        for part, version in self.renderer.items():
-            if here.get(part) != version:
+        for part, version in renderer_versions(self.families).items():
+            stated = self.renderer.get(part)
+            if stated != version:
                 what = "the renderer" if part == "renderer" else f"family '{part}'"
                 raise RunError(
-                    f"round {self.name} was made with version {version} of {what}, here it is {here.get(part)}",
+                    f"round {self.name} was made with version {stated} of {what}, here it is {version}",
                     "install the release of dynslam-bench that the round was made with",
                 )
         digest_here = get_protocol(self.protocol).digest()

@@ -14,6 +14,7 @@ import pytest
 from dynslam_bench import rounds
 from dynslam_bench.core import DynslamError, RunError, file_sha256
 from dynslam_bench.core.fingerprint import this_machine
+from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
 from dynslam_bench.rounds.entering import check_is_new
@@ -24,7 +25,7 @@ from dynslam_bench.rounds.files import (
     open_round,
     renderer_versions,
 )
-from dynslam_bench.rounds.programs import difference
+from dynslam_bench.rounds.programs import difference, program_of
 from dynslam_bench.rounds.running import check_runner
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.testing.template import write_tracker_template
@@ -222,9 +223,10 @@ def test_an_entry_of_another_protocol_or_round_is_refused_by_name(tmp_path: Path
             "made with version 5 of the renderer, here it is 6",
         ),
         (
-            {"renderer": {"renderer": 6, "crowd_xyz": 7}},
+            {"renderer": {"renderer": 6, "walking_xyz": 0, "crowd_xyz": 7}},
             "made with version 7 of family 'crowd_xyz'",
         ),
+        ({"renderer": {}}, "made with version None of the renderer"),
         ({"protocol_digest": "0" * 12}, "protocol 'tum-rgbd/v1' has the digest"),
     ],
 )
@@ -272,6 +274,37 @@ def test_programs_differ_by_settings_code_weights_and_files() -> None:
         ("files", {"f": "2"}, "f"),
     ):
         assert words in difference(frozen, frozen.model_copy(update={field: value}))
+
+
+def test_an_entry_is_frozen_with_its_own_files_and_its_package() -> None:
+    reads = Reads(
+        files={
+            "work:/entries/mine/a.py": "1",
+            "work:/entries/mine/looked_for": "",
+            "work:/entries/other/b.py": "2",
+            "plugin:/c.py": "3",
+            "/usr/lib/libm.so.6": "4",
+        },
+        programs={"work:/entries/mine/slam": "5"},
+    )
+    identity = {
+        "settings": {"file": "/home/a/round/entries/mine/net.onnx", "n": 3},
+        "source": {"the environment": "6"},
+        "parts": ["numpy.linalg:norm", "plugin:/c.py:SPEC"],
+        "tracker_version": "2",
+        "weights": {"file": "7"},
+        "reads": reads.model_dump(),
+    }
+    program = program_of("mine", identity)
+    assert program.settings == {"file": "entries/mine/net.onnx", "n": 3}
+    assert program.files == {
+        "work:/entries/mine/a.py": "1",
+        "plugin:/c.py": "3",
+        "work:/entries/mine/slam": "5",
+    }
+    assert program.weights == {"file": "7"}
+    assert program.code.keys() == {"the environment", "package numpy", "its version"}
+    assert program.code["package numpy"]
 
 
 # -- a whole round ---------------------------------------------------------------------------------
