@@ -28,10 +28,12 @@ class DepthRansacFilter(ObjectFilter[DepthRansacSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Find the person among the features of every box; features without depth are dropped too."""
+        # the dynamic boxes, and the features in each
         keep = np.ones(len(frame.xy), dtype=bool)
         boxes = dynamic_boxes(frame, self.segmentation)
         member = in_boxes(frame.keypoints.xy, boxes)
         for number, in_box in enumerate(member):
+            # the largest set of similar depth is the person; RANSAC draws the same in every run
             measured = np.flatnonzero(in_box & (frame.z > 0))
             rng = stream(state.seed, self.name, number)
             person = person_set(frame.z[measured], self.settings, rng)
@@ -97,11 +99,13 @@ class BoxDepthFilter(ObjectFilter[BoxDepthSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Segment the person in every box and drop the features on them."""
+        # a person's mask in each box; those that are ignored have none
         depth = np.nan_to_num(frame.depth)
         boxes = dynamic_boxes(frame, self.segmentation)
         segmented = [self._segment(box, depth) for box in boxes]
         people = [mask for mask in segmented if mask is not None]
         union = np.logical_or.reduce([np.zeros(depth.shape, bool), *people])
+        # the features on the people, with a border, are dropped
         mask = dilate(union, at_width(self.settings.dilation_px, depth.shape[1]))
         keep = ~inside(mask, frame.keypoints.xy)
         ignored = len(boxes) - len(people)

@@ -164,6 +164,7 @@ def _fill_nearby_mean(
 ) -> None:
     """Add the means ``[M, K]`` of points that are sorted by rows; `first` ``[M]`` is the first that may be near."""
     for i in range(len(at)):
+        # what counts as near: columns to either side, a last row, a share of the depth
         column = at[i, 0]
         depth = at_z[i]
         tolerance = SIMILAR_DEPTH * at_z[i]
@@ -179,6 +180,7 @@ def _fill_nearby_mean(
                 for j in range(means.shape[1]):
                     means[i, j] += values[k, j]
                 count += 1
+        # from sums to means
         if count > 0:
             for j in range(means.shape[1]):
                 means[i, j] /= count

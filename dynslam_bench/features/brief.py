@@ -62,6 +62,7 @@ def _rotated_brief(
     py: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
     """`rotated_brief` with the columns and rows of the 512 places, float32 ``[512]`` each."""
+    # the image as one row, and scratch arrays for one keypoint
     pixels = smoothed.reshape(-1)
     width = smoothed.shape[1]
     offsets = np.empty(512, np.int32)

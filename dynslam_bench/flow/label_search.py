@@ -184,6 +184,7 @@ def search_labels(
     Returns:
         The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
     """
+    # the plan, and labels to begin with: the prediction, or zero flow
     points = matching.reference.points
     n = len(points)
     plan = make_plan(settings)
@@ -214,6 +215,7 @@ def start_labels(
     points: NDArray[np.float32], guess: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     """Labels ``[N, 1, 4]`` of zero flow, or of the motion model's prediction where it is finite."""
+    # u, v, scale in octaves, rotation in radians
     start = np.zeros((len(points), 1, 4), dtype=np.float32)
     if guess is not None:
         offset = guess - points
@@ -273,9 +275,11 @@ def insert(flames: Floats, costs: Longs, trials: Floats, trial: int, cost: Scala
         trial: Which of them.
         cost: Its cost.
     """
+    # worse than the worst flame
     k = len(costs) - 1
     if cost >= costs[k]:
         return
+    # move worse flames down, and put it in its place
     while k > 0 and costs[k - 1] > cost:
         costs[k] = costs[k - 1]
         for j in range(4):
@@ -332,6 +336,7 @@ def run_phase(
         seed: Seed of the frame's random draws.
         rules: `SearchRules`.
     """
+    # numbers that hold for all points, and scratch arrays
     population = state.costs.shape[1]
     opposition = rules.flights.opposition
     iterations = len(rules.flights.counts)
@@ -467,6 +472,7 @@ def opposite_labels(
             low[j] = min(low[j], moths[m, j])
             high[j] = max(high[j], moths[m, j])
     for m in range(population):
+        # one number for the factor, four for the draw, whether they are needed or not
         random = advance(random)
         factor = uniform(scrambled(random), 0)
         random = advance(random)
@@ -590,6 +596,7 @@ def parabola(
     """
     unbounded = np.int64(1 << 40)
     for i in range(start, stop):
+        # costs at the label, and one step to each side along x and along y
         u = labels[i, 0]
         v = labels[i, 1]
         s = labels[i, 2]
@@ -600,6 +607,8 @@ def parabola(
         up = label_cost(i, (u, v - step, s, theta), matching, unbounded)
         down = label_cost(i, (u, v + step, s, theta), matching, unbounded)
         used[i] += 5
+
+        # each axis has a parabola of its own
         labels[i, 0] = u + step * vertex(left, middle, right)
         labels[i, 1] = v + step * vertex(up, middle, down)
 
@@ -607,6 +616,7 @@ def parabola(
 @inlined
 def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
     """Position of the minimum of a parabola through values at -1, 0, 1, within these; 0 if it is not convex."""
+    # second difference: of a parabola the curvature
     curvature = before + after - 2 * middle
     if curvature <= 0:
         return np.float32(0)
@@ -675,6 +685,7 @@ def propagated_labels(
             u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
             v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
             store_candidate(out[i, k], (u, v, labels[j, 2], labels[j, 3]), lower[i], upper[i])
+        # the common motions, applied to this point
         for m in range(len(motions)):
             a = motions[m, 0]
             b = motions[m, 1]
@@ -789,6 +800,7 @@ def ransac_similarity(
     Returns:
         The next state of the draws.
     """
+    # where the tracks begin and end
     x = tracks[0]
     y = tracks[1]
     to_x = tracks[2]
@@ -817,6 +829,7 @@ def ransac_similarity(
             continue
         tx = to_x[i] - a * x[i] + b * y[i]
         ty = to_y[i] - b * x[i] - a * y[i]
+        # the motion with the most voters is kept
         inliers = count_inliers(voters, a, b, tx, ty, limit)
         if inliers > most:
             most = inliers
@@ -832,12 +845,14 @@ def count_inliers(
     voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar
 ) -> int:
     """How many voters a motion takes to where their labels do, by squared distance."""
+    # where voters are, and where they go
     from_x = voters[0]
     from_y = voters[1]
     goal_x = voters[2]
     goal_y = voters[3]
     inliers = np.int32(0)
     for k in range(voters.shape[1]):
+        # what the motion misses the goal by
         rx = a * from_x[k] - b * from_y[k] + tx - goal_x[k]
         ry = b * from_x[k] + a * from_y[k] + ty - goal_y[k]
         inliers = np.int32(inliers + np.int32(rx * rx + ry * ry < limit))
@@ -854,6 +869,7 @@ def nearest(points: Floats, run: Run) -> Longs:
     Returns:
         int64 ``[N, K]``, K = `MOST_NEIGHBOURS` or N - 1; -1 where there are fewer.
     """
+    # sorted by x, so that near points follow each other
     n = len(points)
     neighbours = np.empty((n, max(0, min(MOST_NEIGHBOURS, n - 1))), dtype=np.int64)
     if n > 1:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import Scalar, dividing_kernel
+from dynslam_bench.core.compiled import Scalar, dividing_kernel, inlined_statements
 from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
 from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
 from dynslam_bench.sequences.synthetic.textures import TextureAtlas
@@ -364,6 +364,172 @@ def mip_level(footprint: float, log2_size: int) -> tuple[int, float]:
     return level, min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
 
 
+# Parts of `shade_pixels`, whose statements numba copies into it: arrays that are passed cost nothing.
+
+
+@inlined_statements
+def lies_on_edge(hit: Ints, row: int, column: int) -> bool:
+    """Whether one of a pixel's four neighbours shows another surface; `hit` as in `cast_geometry`."""
+    height, width = hit.shape
+    surface = hit[row, column]
+    return (
+        (column > 0 and hit[row, column - 1] != surface)
+        or (column + 1 < width and hit[row, column + 1] != surface)
+        or (row > 0 and hit[row - 1, column] != surface)
+        or (row + 1 < height and hit[row + 1, column] != surface)
+    )
+
+
+@inlined_statements
+def light_round_cone(
+    p: int, local: Vector, ray: Vector, maps: Reals, shape: Reals, uv: Reals, lights: Reals
+) -> tuple[float, float, float, float]:
+    """Texture coordinates u, v, cosine of incidence and light (Lambert's law) at a point of a round cone.
+
+    Args:
+        p: The primitive.
+        local: The point in the primitive's frame, metres.
+        ray: x and y of the ray of depth 1 in the camera frame, and its length.
+        maps: ``[P, 12]``, see `Primitives.camera_to_local`.
+        shape: See `Primitives`.
+        uv: See `Materials`.
+        lights: See `shade_pixels`.
+    """
+    lx, ly, lz = local
+    x, y, norm = ray
+    # u runs around the axis, v along it
+    u = uv[p, 0, 2]
+    v = uv[p, 0, 3]
+    u += atan2(lx, ly) * _PER_TURN * uv[p, 0, 0]
+    v -= lz * uv[p, 0, 1]
+    # Normal into the camera frame: transpose of the linear part of (camera to local).
+    extent = (shape[p, 0], shape[p, 1], shape[p, 2])
+    nz = round_cone_normal_z(lz, extent)
+    nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
+    nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
+    nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
+    # cosine of incidence, and the ambient light plus that of each lamp the normal faces
+    inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
+    cos = abs(nu * x + nv * y + nw) * inv / norm
+    light = lights[0, 3]
+    for i in range(1, lights.shape[0]):
+        facing = (nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]) * inv
+        if facing > 0.0:
+            light += facing * lights[i, 3]
+    return u, v, cos, light
+
+
+@inlined_statements
+def light_flat_face(
+    p: int, face: int, local: Vector, ray: Vector, uv: Reals, facets: Reals
+) -> tuple[float, float, float, float]:
+    """Texture coordinates u, v, cosine of incidence and light at a point of a box or a quad.
+
+    Args:
+        p: The primitive.
+        face: The face, see `hit_box`; 4 of a quad.
+        local: The point in the primitive's frame, metres.
+        ray: x and y of the ray of depth 1 in the camera frame, and its length.
+        uv: See `Materials`.
+        facets: See `Materials`.
+    """
+    lx, ly, lz = local
+    x, y, norm = ray
+    # normal and light are the same all over a flat face
+    along_ray = facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
+    cos = abs(along_ray) / norm
+    light = facets[p, face, 3]
+    repeats_u = uv[p, face, 0]
+    repeats_v = uv[p, face, 1]
+    u = uv[p, face, 2]
+    v = uv[p, face, 3]
+    if face < 4:
+        # upright faces: v runs down, u to the right as seen from outside
+        side = repeats_u if (face & 1) else -repeats_u
+        u += ly * side if face < 2 else -lx * side
+        v -= lz * repeats_v
+    else:
+        # faces that look up or down, and quads
+        u += lx * repeats_u
+        v -= ly * repeats_v
+    return u, v, cos, light
+
+
+@inlined_statements
+def filter_texture(
+    texels: NDArray[np.uint8],
+    level_offset: Ints,
+    log2_size: Ints,
+    number: int,
+    u: float,
+    v: float,
+    footprint: float,
+    light: float,
+) -> tuple[float, float, float]:
+    """Red, green and blue of a texture in a light, by trilinear filtering: bilinear samples of two mip levels.
+
+    Args:
+        texels: See `TextureAtlas`, as for the next two.
+        level_offset: Where each mip level begins.
+        log2_size: Size of each texture.
+        number: Number of the texture.
+        u: Texture coordinate; the texture is 1 wide, and wraps around.
+        v: Texture coordinate along the other axis.
+        footprint: Square of the texels that the pixel covers at the finest level.
+        light: Factor on the colour.
+    """
+    # unsigned: an index that may be negative costs a test
+    one = np.uint64(1)
+    two = np.uint64(2)
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    log2 = log2_size[number]
+    level, blend = mip_level(footprint, log2)
+    u -= math.floor(u)
+    v -= math.floor(v)
+    for upper in range(2 if blend > 0.0 else 1):
+        bits = log2 - level - upper
+        size = 1 << bits
+        base = level_offset[number, level + upper]
+        # positive, so that int() floors
+        fu = u * size + (size - 0.5)
+        fv = v * size + (size - 0.5)
+        iu = int(fu)
+        iv = int(fv)
+        au = fu - iu
+        av = fv - iv
+        # the four texels around the point; the texture wraps around
+        u0 = iu & (size - 1)
+        v0 = (iv & (size - 1)) << bits
+        u1 = (iu + 1) & (size - 1)
+        v1 = ((iv + 1) & (size - 1)) << bits
+        a = np.uint64(base + ((v0 + u0) << 2))
+        b = np.uint64(base + ((v0 + u1) << 2))
+        c = np.uint64(base + ((v1 + u0) << 2))
+        d = np.uint64(base + ((v1 + u1) << 2))
+        # bilinear weights, times the light and the share of this mip level
+        weight = light * (blend if upper else 1.0 - blend)
+        wa = (1.0 - au) * (1.0 - av) * weight
+        wb = au * (1.0 - av) * weight
+        wc = (1.0 - au) * av * weight
+        wd = au * av * weight
+        red += wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d]
+        green += (
+            wa * texels[a + one]
+            + wb * texels[b + one]
+            + wc * texels[c + one]
+            + wd * texels[d + one]
+        )
+        blue += (
+            wa * texels[a + two]
+            + wb * texels[b + two]
+            + wc * texels[c + two]
+            + wd * texels[d + two]
+        )
+    return red, green, blue
+
+
 @dividing_kernel
 def shade_pixels(
     row0: int,
@@ -406,23 +572,14 @@ def shade_pixels(
     kind, camera_to_local, shape = primitives
     texture, uv, tint, facets = materials
     texels, level_offset, log2_size = atlas
-    height, width = hit.shape
+    width = hit.shape[1]
     samples = jitter.shape[0]
     sample_weight = 1.0 / samples
-    # unsigned: an index that may be negative costs a test
-    one = np.uint64(1)
-    two = np.uint64(2)
     for row in range(row0, row1):
         maps = camera_to_local[row % len(camera_to_local)]
         for column in range(width):
-            # A pixel lies on an edge if one of its four neighbours shows another surface.
             centre_surface = hit[row, column]
-            edge = (
-                (column > 0 and hit[row, column - 1] != centre_surface)
-                or (column + 1 < width and hit[row, column + 1] != centre_surface)
-                or (row > 0 and hit[row - 1, column] != centre_surface)
-                or (row + 1 < height and hit[row + 1, column] != centre_surface)
-            )
+            edge = lies_on_edge(hit, row, column)
             # sum of the samples
             red = 0.0
             green = 0.0
@@ -499,97 +656,20 @@ def shade_pixels(
                     ly = maps[p, 7] + t * (maps[p, 4] * x + maps[p, 5] * y + maps[p, 6])
                     lz = maps[p, 11] + t * (maps[p, 8] * x + maps[p, 9] * y + maps[p, 10])
                     norm = math.sqrt(x * x + y * y + 1.0)
-                    # Texture coordinates, cosine of incidence and light (Lambert's law).
-                    repeats_u = uv[p, face, 0]
-                    repeats_v = uv[p, face, 1]
-                    u = uv[p, face, 2]
-                    v = uv[p, face, 3]
+                    # Texture coordinates, cosine of incidence and light.
+                    local = (lx, ly, lz)
+                    ray = (x, y, norm)
                     if kind[p] == ROUND_CONE:
-                        # u runs around the axis, v along it
-                        u += atan2(lx, ly) * _PER_TURN * repeats_u
-                        v -= lz * repeats_v
-                        # Normal into the camera frame: transpose of the linear part of (camera to
-                        # local).
-                        extent = (shape[p, 0], shape[p, 1], shape[p, 2])
-                        nz = round_cone_normal_z(lz, extent)
-                        nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
-                        nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
-                        nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
-                        # cosine of incidence, and the ambient light plus that of each lamp the normal faces
-                        inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
-                        cos = abs(nu * x + nv * y + nw) * inv / norm
-                        light = lights[0, 3]
-                        for i in range(1, lights.shape[0]):
-                            facing = (
-                                nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]
-                            ) * inv
-                            if facing > 0.0:
-                                light += facing * lights[i, 3]
+                        u, v, cos, light = light_round_cone(p, local, ray, maps, shape, uv, lights)
                     else:
-                        # normal and light are the same all over a flat face
-                        along_ray = (
-                            facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
-                        )
-                        cos = abs(along_ray) / norm
-                        light = facets[p, face, 3]
-                        if face < 4:
-                            # upright faces: v runs down, u to the right as seen from outside
-                            side = repeats_u if (face & 1) else -repeats_u
-                            u += ly * side if face < 2 else -lx * side
-                            v -= lz * repeats_v
-                        else:
-                            u += lx * repeats_u
-                            v -= ly * repeats_v
+                        u, v, cos, light = light_flat_face(p, face, local, ray, uv, facets)
                     # Texel footprint squared, between those along and across a slanted surface.
-                    tex = texture[p, face]
-                    log2 = log2_size[tex]
                     footprint = facets[p, face, 4] * t
                     footprint = footprint * footprint / max(cos, 0.05)
-                    # Trilinear filtering: bilinear samples of two mip levels.
-                    level, blend = mip_level(footprint, log2)
-                    u -= math.floor(u)
-                    v -= math.floor(v)
-                    for upper in range(2 if blend > 0.0 else 1):
-                        bits = log2 - level - upper
-                        size = 1 << bits
-                        base = level_offset[tex, level + upper]
-                        # positive, so that int() floors
-                        fu = u * size + (size - 0.5)
-                        fv = v * size + (size - 0.5)
-                        iu = int(fu)
-                        iv = int(fv)
-                        au = fu - iu
-                        av = fv - iv
-                        # the four texels around the point; the texture wraps around
-                        u0 = iu & (size - 1)
-                        v0 = (iv & (size - 1)) << bits
-                        u1 = (iu + 1) & (size - 1)
-                        v1 = ((iv + 1) & (size - 1)) << bits
-                        a = np.uint64(base + ((v0 + u0) << 2))
-                        b = np.uint64(base + ((v0 + u1) << 2))
-                        c = np.uint64(base + ((v1 + u0) << 2))
-                        d = np.uint64(base + ((v1 + u1) << 2))
-                        # bilinear weights, times the light and the share of this mip level
-                        weight = light * (blend if upper else 1.0 - blend)
-                        wa = (1.0 - au) * (1.0 - av) * weight
-                        wb = au * (1.0 - av) * weight
-                        wc = (1.0 - au) * av * weight
-                        wd = au * av * weight
-                        last_red += (
-                            wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d]
-                        )
-                        last_green += (
-                            wa * texels[a + one]
-                            + wb * texels[b + one]
-                            + wc * texels[c + one]
-                            + wd * texels[d + one]
-                        )
-                        last_blue += (
-                            wa * texels[a + two]
-                            + wb * texels[b + two]
-                            + wc * texels[c + two]
-                            + wd * texels[d + two]
-                        )
+                    # Colour of the texture in this light, times the primitive's tint.
+                    last_red, last_green, last_blue = filter_texture(
+                        texels, level_offset, log2_size, texture[p, face], u, v, footprint, light
+                    )
                     last_red = last_red * tint[p, 0]
                     last_green = last_green * tint[p, 1]
                     last_blue = last_blue * tint[p, 2]
