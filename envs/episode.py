@@ -40,6 +40,7 @@ class FrameOutcome:
             it) and the tracker's stages.
         error: Causal errors against the ground truth; None where there is none.
         reward: What the frame earned.
+        motion_covariance: What the tracker gave, see `TrackResult`; None where it gave none.
     """
 
     index: int
@@ -50,6 +51,7 @@ class FrameOutcome:
     timings: Mapping[str, float]
     error: OnlineSample | None
     reward: float = 0.0
+    motion_covariance: NDArray[np.float64] | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FrameOutcome:
         """Itself: nothing changes it."""

@@ -744,7 +744,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
         outcome = FrameOutcome(
-            index, frame.timestamp, result.state, pose, result.stats, timings, error
+            index,
+            frame.timestamp,
+            result.state,
+            pose,
+            result.stats,
+            timings,
+            error,
+            motion_covariance=None if pose is None else result.motion_covariance,
         )
         self._add_with_reward(self.episode, outcome)
 

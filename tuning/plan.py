@@ -652,8 +652,9 @@ def _misplaced(name: str, used_as: str, other_split: str) -> str:
     """The fault of a sequence that is used in one split and belongs to the other."""
     reason = "the catalogue"
     if name.startswith("synthetic/"):
-        numbers = HELD_OUT_SCENES if other_split == "held-out" else TUNE_SCENES
-        reason = f"its scene ({numbers.start}-{numbers.stop - 1})"
+        held_out = f"{HELD_OUT_SCENES.start} and above"
+        tuning = f"{TUNE_SCENES.start}-{TUNE_SCENES.stop - 1}"
+        reason = f"its scene ({held_out if other_split == 'held-out' else tuning})"
     return f"'{name}' is used as {used_as}, but {reason} puts it into the {other_split} split"
 
 

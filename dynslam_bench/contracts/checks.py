@@ -12,6 +12,7 @@ from numbers import Real
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
@@ -148,11 +149,26 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
             yield Fault(f"{name} with values that are no finite numbers: {bad}")
     if any(_is_number(value) and value < 0 for value in result.timings.values()):
         yield Fault("a timing that is negative")
+    if result.motion_covariance is not None:
+        yield from _covariance_blemishes(result.motion_covariance)
     mask = result.dynamic_mask
     if mask is not None and getattr(mask, "dtype", None) != np.bool_:
         yield Fault(
             f"a dynamic mask of type {getattr(mask, 'dtype', type(mask).__name__)}, expected bool"
         )
+
+
+def _covariance_blemishes(value: object) -> Iterator[Fault]:
+    """What is wrong with a motion covariance; runs state it, and score the others."""
+    expected = "expected a 6x6 covariance of (translation in m, rotation in rad)"
+    matrix = as_covariance(value)
+    if not np.isfinite(matrix).all():
+        yield Fault(f"a motion covariance of shape {np.shape(value)}, or not finite", expected)
+    elif not np.allclose(matrix, matrix.T):
+        off = float(np.abs(matrix - matrix.T).max())
+        yield Fault(f"a motion covariance that is not symmetric, by {off:.2g}", expected)
+    elif (least := float(np.linalg.eigvalsh(matrix)[0])) <= 0:
+        yield Fault(f"a motion covariance with the eigenvalue {least:.2g}", expected)
 
 
 def trajectory_faults(trajectory: object) -> Iterator[Fault]:
@@ -173,7 +189,7 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         tracker: The tracker's id, for the message.
 
     Returns:
-        The result, its pose in float64, without statistics that are not finite.
+        The result, pose and covariance in float64, without statistics that are not finite.
 
     Raises:
         TrackerContractError: It has a fault.
@@ -185,7 +201,19 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     pose = None if result.T_world_cam is None else np.asarray(result.T_world_cam, dtype=np.float64)
-    return replace(result, stats=stats, T_world_cam=pose)
+    covariance = result.motion_covariance
+    if covariance is not None:
+        covariance = as_covariance(covariance)
+    return replace(result, stats=stats, T_world_cam=pose, motion_covariance=covariance)
+
+
+def as_covariance(value: object) -> NDArray[np.float64]:
+    """A covariance float64 ``[6, 6]`` of what a tracker gave; NaN where that is no array of 36 numbers."""
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.full((6, 6), np.nan)
+    return matrix.reshape(6, 6) if matrix.size == 36 else np.full((6, 6), np.nan)
 
 
 def check_sensors(spec: TrackerSpec, sequence: Sequence) -> None:

@@ -164,6 +164,10 @@ class TrackResult:
         dynamic_mask: bool ``[H, W]``, pixels held for dynamic, or None.
         keypoints_xy: float32 ``[N, 2]``, raw pixels of the features, for rendering; or None.
         keypoints_keep: bool ``[N]``, which of them were kept; or None.
+        motion_covariance: Covariance float64 ``[6, 6]`` of the motion ``T_prev_cur`` from the last
+            frame with a pose to this one: of the twist (translation in metres, rotation in radians)
+            in ``T_true = T_estimated Exp(twist)``; None if the tracker does not know how sure it
+            is. It is scored, and changes no pose.
     """
 
     T_world_cam: NDArray[np.float64] | None
@@ -173,6 +177,7 @@ class TrackResult:
     dynamic_mask: NDArray[np.bool_] | None = None
     keypoints_xy: NDArray[np.float32] | None = None
     keypoints_keep: NDArray[np.bool_] | None = None
+    motion_covariance: NDArray[np.float64] | None = None
 
 
 def stage_seconds(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:

@@ -16,7 +16,7 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.slam_env import resolve_device
 from dynslam_bench.runs.own_code import package_code
-from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
 
 _FIELDS_OF_KIND = (
@@ -200,8 +200,9 @@ def _answer(
 def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
     """Description of this machine: code, packages and device, and which sequences and networks it lacks."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
-    if not cached_checkpoint(COCO):
-        lacking.add(f"network {COCO.id}")
+    for checkpoint in CHECKPOINTS.values():
+        if not cached_checkpoint(checkpoint):
+            lacking.add(f"network {checkpoint.id}")
     return {
         "code": package_code(),
         "packages": set(versions().items()),

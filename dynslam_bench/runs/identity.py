@@ -48,6 +48,7 @@ from dynslam_bench.runs.own_code import (
 from dynslam_bench.runs.record import ASKED_DIGITS, IDENTITY_SCHEME, StartMap, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.view import SequencePart, reader_of, sequence_part_of
@@ -366,7 +367,7 @@ def _files_of(
     """
     weights = named_digests(settings, words=is_outside_package(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
-    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
+    if source in ("embedded", *CHECKPOINTS) and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
     named: dict[str, Any] = {"weights": weights}
     if not tracker.files:

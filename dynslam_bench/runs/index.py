@@ -11,6 +11,7 @@ from typing import Any
 
 from dynslam_bench.core import RunError
 from dynslam_bench.runs.layout import (
+    COVARIANCES,
     FINAL,
     INDEX_FILE,
     ONLINE,
@@ -66,6 +67,7 @@ class RunIndex:
         files = (
             f"{run}/{ONLINE}",
             f"{run}/{FINAL}",
+            f"{run}/{COVARIANCES}",
             f"{sequence}/{TRUTH}",
             f"{sequence}/{STAMPS}",
         )

@@ -15,11 +15,12 @@ from dynslam_bench.runs.identity import libraries, source_digests
 from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.trackers.registry import TRACKERS
 
 NOT_RECORDED = "its record does not say what it was made by"
-_NETWORKS = ("embedded", "coco")
+_NETWORKS = ("embedded", *CHECKPOINTS)
 """Weights that no setting names, see `build_segmenter.weights_digest`."""
 
 

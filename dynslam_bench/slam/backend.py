@@ -39,6 +39,7 @@ from dynslam_bench.slam.motion_model import (
     trajectory,
 )
 from dynslam_bench.slam.observations import Observations, observe
+from dynslam_bench.slam.pose_optimisation import motion_covariance
 from dynslam_bench.slam.relocalisation import MotionBound, PoseSearch, RelocalisationGate
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 from dynslam_bench.slam.tracking import (
@@ -274,7 +275,11 @@ class Backend:
 
         # insert a keyframe if the frame shows enough new
         result = self._update_map(frame, tracked, map_fit, pose_in_root_map)
-        return _with_match_counts(result, map_fit, initial)
+        result = _with_match_counts(result, map_fit, initial)
+        # a length in metres is known with depth alone
+        if not self.uses_depth:
+            return result
+        return replace(result, motion_covariance=motion_covariance(map_fit.estimate))
 
     # ------------------------------------------------------------------ steps of tracking
 

@@ -238,6 +238,7 @@ class SlamPipeline:
             filter_result.mask,
             keypoints.xy,
             filter_result.keep,
+            result.motion_covariance,
         )
 
     # ------------------------------------------------------------------ steps of a frame

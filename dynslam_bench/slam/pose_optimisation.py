@@ -40,6 +40,8 @@ MEDIAN_CHI2 = 1.386
 """Median of chi-square with two degrees of freedom."""
 LEAST_VARIANCE = 0.01
 """The residuals' variance is at least this share of the assumed one."""
+COVARIANCE_FACTOR = 1.0
+"""Calibrated factor on the covariance of a pose: residuals do not show all errors of the map that it is fitted to."""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane are never inliers."""
 MIN_POINTS = 6
@@ -112,6 +114,23 @@ class PoseEstimate:
     count: int
     residual_px: float
     information: Array
+
+
+def motion_covariance(estimate: PoseEstimate) -> Array | None:
+    """Covariance ``[6, 6]`` of the motion to a pose from the frame before it; None if it is not determined.
+
+    It is the inverse of the pose's information, scaled by the variance of the residuals over the
+    assumed one, and by `COVARIANCE_FACTOR`. The frame before and the map count as known.
+    ``exp(xi) T_cam_world`` is ``T_world_cam exp(-xi)`` seen from the other side, so that the
+    matrix is that of a right perturbation of ``T_prev_cur``, too.
+    """
+    variance = max(estimate.residual_px**2 / MEDIAN_CHI2, LEAST_VARIANCE)
+    try:
+        covariance = np.linalg.inv(estimate.information)
+    except np.linalg.LinAlgError:
+        return None
+    scaled = COVARIANCE_FACTOR * variance * covariance
+    return np.asarray(0.5 * (scaled + scaled.T))
 
 
 @kernel
