@@ -30,6 +30,7 @@ SAMPLES = 2
 
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
     """Anchors ``[A, 4]`` of each level around the origin, rounded to pixels as the published models have them."""
+    # of each ratio the height and width of an anchor with the area 1
     ratios = torch.tensor(config.anchor_ratios, device="cpu")
     heights = ratios.sqrt()
     widths = 1 / ratios.sqrt()
@@ -553,6 +554,7 @@ class MaskRCNN(nn.Module):
         Returns:
             ``[1, 3, H', W']`` and the height and width of the image inside it.
         """
+        # the shorter side becomes `min_side`, unless the longer one exceeds `max_side` then
         config = self.config
         height = int(image.shape[-2])
         width = int(image.shape[-1])
@@ -577,6 +579,7 @@ class MaskRCNN(nn.Module):
             score: Least score.
             iou: Overlap of two boxes of one class above which the weaker one is dropped.
         """
+        # backbone, proposals, and the heads on them
         x, size = self.prepare(image)
         levels, mask_levels = self.backbone(x.contiguous(memory_format=torch.channels_last))
         height = int(x.shape[2])
@@ -610,6 +613,7 @@ class MaskRCNN(nn.Module):
             generator: Draws the samples of anchors and proposals.
             per_image: Proposals an image that enter the box losses.
         """
+        # backbone on the padded batch
         batch, _, rows, columns = images.shape
         x = self._pad(normalise(images)).contiguous(memory_format=torch.channels_last)
         height = int(x.shape[2])
@@ -766,6 +770,7 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     overlap = box_iou(truth, boxes)
     best, index = overlap.max(dim=0)
     result = index.masked_fill(best < high, IGNORED).masked_fill(best < low, NEGATIVE)
+    # every object that is overlapped at all gets the boxes that overlap it most
     if keep_best:
         top = overlap.max(dim=1, keepdim=True).values
         forced = ((overlap == top) & (overlap > 0)).any(dim=0)

@@ -151,6 +151,7 @@ def yolo_images(text: str) -> LabelledImages:
             names.
         SequenceError: ``data.yaml`` cannot be read.
     """
+    # the images and their labels
     folder = Path(text).expanduser()
     root = folder / "images"
     labels = folder / "labels"
@@ -193,6 +194,7 @@ def _yolo_names(path: Path) -> dict[int, str]:
 
 def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledImage:
     """An image and the polygons of its label file, which may be missing."""
+    # a polygon a line
     rgb = _read(path)
     masks = []
     names = []
@@ -272,6 +274,7 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         "COCO's are polygons or run lengths",
         of=(ValueError, TypeError, LookupError, OverflowError),
     ):
+        # polygons, else run lengths
         if isinstance(segmentation, list):
             return _fill([_polygon(points) for points in segmentation], shape)
         counts = segmentation["counts"]
