@@ -619,10 +619,12 @@ class MaskRCNN(nn.Module):
         height = int(x.shape[2])
         width = int(x.shape[3])
         levels, mask_levels = self.backbone(x)
+        # proposals and the losses of their network
         proposals, anchors, logits, codes = self.rpn(
             levels, height, width, [(rows, columns)] * batch
         )
         objectness, regression = rpn_loss(anchors, logits, codes, boxes, generator)
+        # losses of the heads on a sample of the proposals
         heads = self.roi_heads.losses(
             levels[:4], mask_levels, proposals, boxes, labels, masks, height, generator, per_image
         )

@@ -201,6 +201,7 @@ def hit_primitive(
     kind: int, origin: Vector, direction: Vector, shape: Vector, t_max: float
 ) -> tuple[float, int]:
     """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    # a round cone has one face
     if kind == ROUND_CONE:
         t = hit_round_cone(origin, direction, shape, t_max)
         return t, 0 if t < t_max else -1
@@ -243,6 +244,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
             for tx in range(boxes[p, 0], boxes[p, 2] + 1):
                 start[ty * tiles_x + tx + 1] += 1
     start = np.cumsum(start).astype(np.int32)
+    # where the next member of each tile is written
     fill = start[:-1].copy()
     members = np.empty(start[-1], np.int32)
     for n in range(order.shape[0]):
@@ -290,6 +292,7 @@ def cast_geometry(
         y = (row - cy) / fy
         last = -1
         for column in range(width):
+            # candidates of the pixel's tile
             tile = (row // TILE) * tiles_x + column // TILE
             first = start[tile]
             end = start[tile + 1]
@@ -323,6 +326,7 @@ def cast_geometry(
                     t = t_hit
                     p = q
                     face = face_hit
+            # what the pixel sees
             last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
             depth[row, column] = t if p >= 0 else 0.0
@@ -732,6 +736,7 @@ def flow_field(
     width = hit.shape[1]
     for row in range(row0, row1):
         for column in range(width):
+            # no flow, unless a point is seen
             flow[row, column, 0] = flow[row, column, 1] = np.nan
             # unproject
             p = hit[row, column] >> 3
@@ -895,6 +900,7 @@ def _mark_projector_shadow(
         if z <= 0.0:
             in_shadow[u] = True
             continue
+        # the column of the projector that lights the point
         column = u + fx_baseline / z
         in_shadow[u] = column >= leftmost + 0.5
         leftmost = min(leftmost, column)
@@ -904,6 +910,7 @@ def _mark_projector_shadow(
 def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, float]:
     """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
     height, width = depth.shape
+    # the pixel itself, then the four others that have a depth
     lowest = depth[row, u]
     highest = depth[row, u]
     for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
