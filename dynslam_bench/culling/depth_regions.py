@@ -143,7 +143,14 @@ class BoxDepthFilter(ObjectFilter[BoxDepthSettings]):
 def _window(
     box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple[int, ...]
 ) -> tuple[slice, slice]:
-    """Rows and columns of a box that is grown on all sides, within an image of a shape."""
+    """Rows and columns of a box that is grown on all sides, within an image of a shape.
+
+    Args:
+        box: Corners x0, y0, x1, y1 in pixels.
+        grow_x: Pixels added on the left and on the right; negative to shrink.
+        grow_y: Pixels added above and below.
+        shape: Height and width of the image.
+    """
     x0, y0, x1, y1 = box.astype(np.float64)
     low = np.clip((y0 - grow_y, x0 - grow_x), 0, shape).astype(int)
     high = np.clip(np.ceil((y1 + grow_y, x1 + grow_x)), 0, shape).astype(int)

@@ -303,7 +303,14 @@ def _align(
 
 @kernel
 def _squared_errors(pose: Array, points: Array, pixels: Array, camera: Intrinsics) -> Array:
-    """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
+    """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera.
+
+    Args:
+        pose: Transform ``[4, 4]`` into the camera frame.
+        points: ``[N, 3]``, metres.
+        pixels: Undistorted pixels ``[N, 2]`` that they are compared with.
+        camera: Intrinsics.
+    """
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
         x, y, z = transform_point(pose, points[i])

@@ -562,7 +562,14 @@ def _patch_difference(
     xy1: NDArray[np.float32],
     xy2: NDArray[np.float32],
 ) -> NDArray[np.int64]:
-    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
+    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``.
+
+    Args:
+        first: uint8 ``[H, W]``, grey levels.
+        second: uint8 ``[H, W]``, grey levels of the other image.
+        xy1: Pixels ``[N, 2]`` of the first image.
+        xy2: Pixels ``[N, 2]`` of the second image.
+    """
     difference = _patches(first, xy1) - _patches(second, xy2)
     return np.asarray(np.abs(difference).sum(axis=0))
 

@@ -104,7 +104,14 @@ class MultiViewFilter(BaseFilter[MultiViewSettings]):
         pose: NDArray[np.float64],
         camera: Camera,
     ) -> NDArray[np.int64]:
-        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
+        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference.
+
+        Args:
+            views: Keyframes whose features are projected into the frame.
+            depth: float32 ``[H, W]`` metres, 0 missing.
+            pose: Camera-to-world pose ``[4, 4]`` of the frame.
+            camera: Intrinsics and distortion.
+        """
         # the keyframes' points in the world, and the rays to them from both cameras
         world = []
         from_view = []

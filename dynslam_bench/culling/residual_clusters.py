@@ -82,7 +82,14 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
         xy: NDArray[np.float64],
         z: NDArray[np.floating],
     ) -> NDArray[np.float64]:
-        """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it."""
+        """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it.
+
+        Args:
+            frame: The current frame.
+            state: With the previous frame, its pose and the predicted one.
+            xy: Raw pixels of the samples.
+            z: Their depths ``[N]``, metres.
+        """
         assert state.previous is not None
         assert state.T_world_prev is not None
         assert state.T_world_pred is not None

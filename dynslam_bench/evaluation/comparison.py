@@ -386,6 +386,12 @@ def apply_policy(
 ) -> tuple[Trajectory, NDArray[np.bool_] | None]:
     """The estimate with its lost frames held or left out, as the protocol has it.
 
+    Args:
+        estimate: Camera-to-world poses as the tracker gave them.
+        protocol: Its `lost_frames` policy is applied.
+        input_timestamps: Stamps of all input frames, seconds; None if they are not known.
+        diagnostics: Gains a line on what was held or left out.
+
     Returns:
         The estimate, and which input frames were tracked ``[N]``; None where the input frames are
         not known.

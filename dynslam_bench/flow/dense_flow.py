@@ -457,7 +457,15 @@ def fit_regional_motion(
 
 @kernel
 def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None:
-    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``."""
+    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``.
+
+    Args:
+        flow: float32 ``[H, W, 2]``, pixels.
+        valid: bool ``[H, W]``, consistent pixels.
+        labels: int32 ``[H / 2, W / 2]``, `Superpixels.labels`.
+        sums: Added to: number of pixels, number of consistent ones, and their sums of x, y, u and
+            v.
+    """
     # a full-image pixel belongs to the region of its half-resolution pixel
     for y in range(len(valid)):
         row = labels[min(y // 2, len(labels) - 1)]
@@ -571,7 +579,16 @@ def superpixels(
 def assign_pixels(
     gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints
 ) -> None:
-    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
+    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`.
+
+    Args:
+        gray: uint8 ``[H, W]``.
+        centres: float64 ``[K, 3]``: x, y in pixels, and grey level.
+        size: Half side of the window in which a centre competes, pixels.
+        weight: Squared pixels that a squared grey level weighs as much as.
+        iterations: Rounds of assignment and update.
+        labels: int32 ``[H, W]``, filled with each pixel's centre.
+    """
     height, width = gray.shape
     distance = np.empty((height, width), dtype=np.float64)
     sums = np.empty((len(centres), 4), dtype=np.float64)
@@ -753,7 +770,16 @@ def filter_patch(
 def read_descriptors(
     start: int, stop: int, columns: int, image: ImageArrays, tables: CostTables, out: Words
 ) -> None:
-    """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors."""
+    """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        columns: Half-resolution pixels a row.
+        image: Orientation maps of the image.
+        tables: Tables of the cost, with the sampling pattern.
+        out: Filled.
+    """
     for y in range(start, stop):
         for x in range(columns):
             # the centre of the half-resolution pixel in the full image
@@ -960,7 +986,16 @@ def differs(
     best: Floats,
     winner: Floats,
 ) -> bool:
-    """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does."""
+    """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does.
+
+    Args:
+        label: The label that is tried.
+        centre: Centre of the region, full-image pixels.
+        region: int64, flat indices of the region's half-resolution pixels.
+        columns: Half-resolution pixels a row.
+        best: `ChosenLabels.best`, infinite where a pixel has no label yet.
+        winner: `ChosenLabels.winner`.
+    """
     u, v, a, b = label
     limit = np.float32(SAME_PX * SAME_PX)
     for member in region:
@@ -983,7 +1018,14 @@ def differs(
 
 @inlined
 def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge."""
+    """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge.
+
+    Args:
+        members: int64, flat indices of the pixels.
+        rows: Rows of the image.
+        columns: Columns of the image.
+        margin: Pixels around the box.
+    """
     # the box around the pixels
     top = rows
     bottom = -1
@@ -1078,7 +1120,16 @@ def raw_costs(
 def spread_labels(
     start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats
 ) -> None:
-    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
+    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres.
+
+    Args:
+        start: First row of the full image.
+        stop: One past the last row.
+        winner: float32 ``[h, w, 4]``, `ChosenLabels.winner`.
+        regions: int32 ``[h, w]``, `Superpixels.labels`.
+        centres: float32 ``[K, 2]`` of the regions, full-image pixels.
+        flow: float32 ``[H, W, 2]``, filled.
+    """
     for y in range(start, stop):
         # the label of the half-resolution pixel
         row = min(y // 2, winner.shape[0] - 1)

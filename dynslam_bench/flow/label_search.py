@@ -226,7 +226,15 @@ def start_labels(
 def initial_state(
     settings: DaisySettings, start: NDArray[np.float32], population: int, ceiling: int
 ) -> SearchState:
-    """The state before anything was evaluated, with bounds around the start labels ``[N, 1, 4]``."""
+    """The state before anything was evaluated, with bounds around the start labels ``[N, 1, 4]``.
+
+    Args:
+        settings: Range of the search along each dimension of a label.
+        start: Labels in the middle of the bounds: u, v (pixels), log2 of the scale, rotation
+            (radians).
+        population: Labels kept a point.
+        ceiling: Largest possible cost, which no label has been better than yet.
+    """
     n = len(start)
     rotation = np.deg2rad(settings.rotation_range_deg)
     extent = np.array(
@@ -438,7 +446,16 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
 def place_moths(
     moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar
 ) -> Scalar:
-    """Draw the moths from `placed` on within the bounds, and try them; returns the next random state."""
+    """Draw the moths from `placed` on within the bounds, and try them; returns the next random state.
+
+    Args:
+        moths: float32 ``[P, 4]``, the population; filled from `placed` on.
+        placed: Moths that have a place already.
+        lower: float32 ``[4]``, least values of a label.
+        upper: float32 ``[4]``, largest values of a label.
+        trials: float32 ``[P, 4]``, filled with the moths that are placed now.
+        random: State of the point's random numbers.
+    """
     for m in range(placed, len(moths)):
         random = advance(random)
         bits = scrambled(random)
@@ -569,7 +586,14 @@ def draw_label(
 ) -> None:
     """Fill a label: anywhere in the bounds (`shrink` 1), or in a window around the best label.
 
-    `window` is half the window's side as a share of the bounds' extent.
+    Args:
+        label: float32 ``[4]``, filled.
+        bits: 64 random bits.
+        lower: float32 ``[4]``, least values.
+        upper: float32 ``[4]``, largest values.
+        best: float32 ``[4]``, the best label so far.
+        window: Half side of the window around it, as a share of the bounds' extent.
+        shrink: Factor by which the window shrinks a draw; 1 for draws anywhere.
     """
     for j in range(4):
         extent = upper[j] - lower[j]
@@ -844,7 +868,16 @@ def ransac_similarity(
 def count_inliers(
     voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar
 ) -> int:
-    """How many voters a motion takes to where their labels do, by squared distance."""
+    """How many voters a motion takes to where their labels do, by squared distance.
+
+    Args:
+        voters: float32 ``[4, M]``: x and y of points, and where their labels take them.
+        a: Scale times cosine of the rotation.
+        b: Scale times sine of the rotation.
+        tx: Translation along x, pixels.
+        ty: Translation along y, pixels.
+        limit: Squared distance, pixels, below which a voter agrees.
+    """
     # where voters are, and where they go
     from_x = voters[0]
     from_y = voters[1]

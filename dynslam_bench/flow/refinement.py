@@ -392,7 +392,16 @@ def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
 
 @inlined
 def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: Floats) -> None:
-    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
+    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on.
+
+    Args:
+        image: uint8 ``[H, W]``.
+        x: Column of the first sample, pixels.
+        y: Row of the first sample, pixels.
+        rows: Rows of samples.
+        pitch: Samples a row.
+        out: float32, flat, filled.
+    """
     # the pixel that contains (x, y), and the parts of a pixel beyond it
     flat = image.reshape(-1)
     stride = np.int64(image.shape[1])
@@ -417,7 +426,14 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
 
 @inlined
 def warp_patch(image: Bytes, warp: Warp, reach: int, space: Workspace) -> None:
-    """Fill the patch: bilinear samples of a square of radius `reach` pixels under the warp."""
+    """Fill the patch: bilinear samples of a square of radius `reach` pixels under the warp.
+
+    Args:
+        image: uint8 ``[H, W]``, the target with its border.
+        warp: Where the window's centre lies in it, with scale and rotation.
+        reach: Half side of the square.
+        space: Its `patch` is filled.
+    """
     # positions are whole numbers of 65536ths of a pixel
     one = np.float32(65536)
     far = np.float32(reach)
@@ -517,7 +533,14 @@ def bilinear_weights(x: Scalar, y: Scalar) -> tuple[Scalar, Scalar, Scalar, Scal
 def shifted(
     patch: Floats, k: int, pitch: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> Scalar:
-    """Sixteen pixels of the patch from index k on, shifted by a part of a pixel (`bilinear_weights`)."""
+    """Sixteen pixels of the patch from index k on, shifted by a part of a pixel (`bilinear_weights`).
+
+    Args:
+        patch: float32, flat, grey levels.
+        k: Index of the first pixel.
+        pitch: Pixels a row.
+        weights: Bilinear weights of the four pixels around each.
+    """
     w00, w01, w10, w11 = weights
     upper = w00 * load(patch, k) + w01 * load(patch, k + 1)
     return upper + w10 * load(patch, k + pitch) + w11 * load(patch, k + pitch + 1)
@@ -540,7 +563,14 @@ def patch_shift(
 def compare_with_template(
     space: Workspace, mean: Scalar, at: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
-    """Sums over the window of the patch w, less the template's mean: of w, w^2, and w times template and gradients."""
+    """Sums over the window of the patch w, less the template's mean: of w, w^2, and w times template and gradients.
+
+    Args:
+        space: Patch, template and its gradients.
+        mean: Mean grey level of the template.
+        at: Index of the window's first pixel in the patch.
+        weights: Of the part of a pixel by which the window is shifted.
+    """
     # sums over the window, sixteen pixels at a time
     mean_t = spread(mean)
     zero = spread(np.float32(0))

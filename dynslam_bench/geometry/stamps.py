@@ -193,7 +193,14 @@ def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], In
 def _candidates(
     a: NDArray[np.float64], b: NDArray[np.float64], max_dt: float, *, strict: bool
 ) -> tuple[Index, Index, NDArray[np.float64]]:
-    """All pairs of indices within `max_dt` with their |dt|; both lists sorted."""
+    """All pairs of indices within `max_dt` with their |dt|; both lists sorted.
+
+    Args:
+        a: Stamps in seconds ``[N]``, ascending.
+        b: Stamps in seconds ``[M]``, ascending.
+        max_dt: Largest time difference, seconds.
+        strict: Whether the difference must be smaller.
+    """
     # Look a little farther than `max_dt`, as sums round; the differences decide.
     slack = 1e-9 + 4 * np.spacing(max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)))
     low = np.searchsorted(b, a - max_dt - slack, side="left")

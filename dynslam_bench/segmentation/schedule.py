@@ -562,7 +562,14 @@ def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instanc
 def shift_mask(
     mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0
 ) -> NDArray[np.bool_]:
-    """A mask scaled about the centre of its box and moved by `dx`, `dy` pixels."""
+    """A mask scaled about the centre of its box and moved by `dx`, `dy` pixels.
+
+    Args:
+        mask: bool ``[H, W]``.
+        dx: Pixels to the right.
+        dy: Pixels downwards.
+        scale: Factor on its size.
+    """
     rows, columns = np.nonzero(mask)
     if not rows.size:
         return mask

@@ -39,7 +39,14 @@ def anchor_cells(config: NetworkConfig) -> list[Tensor]:
 
 
 def anchors_of(cells: list[Tensor], levels: list[Tensor], height: int, width: int) -> list[Tensor]:
-    """Anchors ``[H_l * W_l * A, 4]`` of each level, row by row."""
+    """Anchors ``[H_l * W_l * A, 4]`` of each level, row by row.
+
+    Args:
+        cells: Anchors ``[A, 4]`` of each level around the origin, of `anchor_cells`.
+        levels: Feature maps ``[B, C, H_l, W_l]``.
+        height: Height of the network's input, pixels.
+        width: Width of the network's input, pixels.
+    """
     result = []
     for cell, level in zip(cells, levels, strict=True):
         rows, columns = level.shape[-2:]
@@ -713,7 +720,14 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
 
 
 def grouped_nms(boxes: Tensor, scores: Tensor, groups: Tensor, threshold: float) -> Tensor:
-    """Suppression within each group (class or level); indices of all that stay, best first."""
+    """Suppression within each group (class or level); indices of all that stay, best first.
+
+    Args:
+        boxes: ``[N, 4]``: x0, y0, x1, y1.
+        scores: ``[N]``.
+        groups: Number of each box's group ``[N]``.
+        threshold: IoU above which the weaker of two boxes is dropped.
+    """
     kept = []
     for group in sorted(set(groups.tolist())):
         members = torch.nonzero(groups == group)[:, 0]

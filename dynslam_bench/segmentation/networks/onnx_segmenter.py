@@ -464,7 +464,16 @@ def _keep(
     settings: SegmentationSettings,
     floor: float,
 ) -> NDArray[np.intp]:
-    """Indices of the wanted detections, best first, that non-maximum suppression within each class keeps."""
+    """Indices of the wanted detections, best first, that non-maximum suppression within each class keeps.
+
+    Args:
+        boxes: Corners ``[N, 4]``, pixels of the input.
+        scores: ``[N]``.
+        labels: Class numbers ``[N]``.
+        layout: Names of the classes, and whether suppression is inside the network.
+        settings: Which classes are dynamic.
+        floor: Least score.
+    """
     # dynamic classes with enough score, the best first
     keep = np.flatnonzero((scores >= floor) & np.isin(labels, _wanted(layout, settings)))
     if not keep.size:
@@ -588,7 +597,16 @@ def _decode_semantic(
 def _interpolation(
     cells: int, length: int, scale: float, offset: float, count: int, aligned: bool
 ) -> Float:
-    """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis."""
+    """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis.
+
+    Args:
+        cells: Logits along the axis.
+        length: Pixels of the network's input along it.
+        scale: Input pixels in a frame pixel.
+        offset: Place of the frame's first pixel in the input.
+        count: Frame pixels along the axis.
+        aligned: Whether the first and the last cell lie at the input's outermost pixels.
+    """
     # where the pixels' centres lie in the input, then among the cells
     at_input = (np.arange(count) + 0.5) * scale + offset - 0.5
     if aligned:

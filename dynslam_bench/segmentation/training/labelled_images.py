@@ -303,11 +303,13 @@ def decode_runs(text: str) -> list[int]:
         ValueError: The text ends within a number, a number is longer than any image, or a character
             is no digit.
     """
+    # the whole text must be numbers of at most 13 digits
     rest = re.sub(rf"\A(?:{_NOT_LAST}{{0,12}}{_LAST})*", "", text, count=1)
     if rest:
         raise ValueError(
             f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}"
         )
+    # each number from its digits, then from a difference to a run
     runs: list[int] = []
     for number in re.findall(f"{_NOT_LAST}*{_LAST}", text):
         digits = [ord(character) - 48 for character in number]

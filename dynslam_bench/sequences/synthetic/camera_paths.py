@@ -112,7 +112,14 @@ def _swing_in_slot(t: Array, period: float, slot: int) -> Array:
 
 
 def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Array:
-    """Handheld jitter: sines from 0.2 to 4 Hz whose amplitude falls with the frequency."""
+    """Handheld jitter: sines from 0.2 to 4 Hz whose amplitude falls with the frequency.
+
+    Args:
+        rng: Draws frequencies and phases.
+        t: Seconds ``[N]``.
+        amplitude: Of the slowest sine, in the unit of the result.
+        axes: Number of axes.
+    """
     total = np.zeros((len(t), axes))
     for frequency in (0.23, 0.51, 0.97, 1.7, 2.6, 3.9):
         # each axis has a frequency and a phase of its own

@@ -140,7 +140,15 @@ def hit_box(origin: Vector, direction: Vector, half: Vector, t_max: float) -> tu
 
 @dividing_kernel
 def hit_sphere(origin: Vector, direction: Vector, dd: float, r: float, best: float) -> float:
-    """Nearest hit with a sphere about the origin if it is before `best`, else that; dd is the direction's square."""
+    """Depth of the nearest hit with a sphere about the origin if it is before `best`, else that.
+
+    Args:
+        origin: Origin of the ray, metres from the sphere's centre.
+        direction: Direction of the ray, of depth 1.
+        dd: Squared length of the direction.
+        r: Radius, metres.
+        best: Depth of the nearest hit so far.
+    """
     ox, oy, oz = origin
     dx, dy, dz = direction
     # |o + t d|^2 = r^2, by half the linear coefficient
@@ -200,7 +208,15 @@ def hit_round_cone(origin: Vector, direction: Vector, shape: Vector, t_max: floa
 def hit_primitive(
     kind: int, origin: Vector, direction: Vector, shape: Vector, t_max: float
 ) -> tuple[float, int]:
-    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one.
+
+    Args:
+        kind: `BOX`, `ROUND_CONE` or a quad.
+        origin: Origin of the ray in the primitive's frame.
+        direction: Direction of the ray, of depth 1.
+        shape: Half extents, or height and two radii of a round cone.
+        t_max: Hits from here on do not count.
+    """
     # a round cone has one face
     if kind == ROUND_CONE:
         t = hit_round_cone(origin, direction, shape, t_max)
@@ -728,9 +744,17 @@ def flow_field(
 ) -> None:
     """Exact optical flow (float32 pixels) of rows.
 
-    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other
-    camera's frame. Where nothing is hit or the point leaves the front of the camera, the flow is
-    NaN.
+    Where nothing is hit or the point leaves the front of the camera, the flow is NaN.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        intrinsics: The camera.
+        hit: int32 ``[H, W]``, see `cast_geometry`.
+        depth: float64 ``[H, W]``, see `cast_geometry`.
+        motion: ``[P, 12]``, row-major 3x4 transforms of a point fixed to each primitive, from this
+            camera's frame to the other camera's.
+        flow: float32 ``[H, W, 2]``, filled.
     """
     fx, fy, cx, cy = intrinsics
     width = hit.shape[1]
@@ -765,8 +789,17 @@ def motion_blur(
 ) -> None:
     """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred.
 
-    ``exact`` is the whole colour image as flat float64: what all taps read is converted once.
-    ``shares`` are `tap_shares`. Unsigned indices need no test for negative ones.
+    Unsigned indices need no test for negative ones.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        color: float32 ``[H, W, 3]``, the sharp colours.
+        exact: These colours as flat float64: what all taps read is converted once.
+        shares: Places of the taps, `tap_shares`.
+        flow: float32 ``[H, W, 2]`` to the next frame, pixels.
+        shutter: Share of the frame interval for which the shutter is open.
+        blurred: float32 ``[H, W, 3]``, filled.
     """
     height, width = color.shape[:2]
     # taps stay where a texel to the right and one below exist
@@ -908,7 +941,14 @@ def _mark_projector_shadow(
 
 @dividing_kernel
 def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, float]:
-    """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
+    """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below.
+
+    Args:
+        depth: Exact z-depth ``[H, W]``, metres, 0 for nothing.
+        row: Row of the pixel.
+        u: Column of the pixel.
+        reach: Pixels.
+    """
     height, width = depth.shape
     # the pixel itself, then the four others that have a depth
     lowest = depth[row, u]
@@ -1007,7 +1047,18 @@ def expose(
     shot_noise: float,
     out: Ints,
 ) -> None:
-    """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping."""
+    """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        seed: Seed of this frame's noise.
+        color: Colour ``[H, W, 3]`` from 0 to 255.
+        gain: Factor of each row ``[H]``.
+        read_noise: Standard deviation of the noise without light, grey levels.
+        shot_noise: Variance of the noise a grey level of signal.
+        out: uint8 ``[H, W, 3]``, filled.
+    """
     width = color.shape[1]
     for row in range(row0, row1):
         for u in range(width):

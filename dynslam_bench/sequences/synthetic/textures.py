@@ -64,7 +64,14 @@ def build_atlas(textures: list[Image]) -> TextureAtlas:
 def smooth_noise(
     rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None
 ) -> NDArray[np.float64]:
-    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, smoothly blended."""
+    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, smoothly blended.
+
+    Args:
+        rng: Draws the lattice.
+        size: Edge of the texture, texels.
+        cells: Cells along u.
+        cells_v: Cells along v; None for as many.
+    """
     cells_v = cells if cells_v is None else cells_v
     lattice = rng.random((cells_v, cells)) * 2 - 1
 
