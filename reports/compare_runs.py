@@ -170,7 +170,7 @@ def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Pa
 
 
 def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
-    """How to read the table, and in which settings the trackers differ."""
+    """Sentences on reading the table, and on the settings in which the trackers differ."""
     changed = "; ".join(
         f"{name}: {', '.join(words)}" for name, words in differences.items() if words
     )
@@ -320,7 +320,7 @@ def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
 
 
 def _not_current(first: RunRow, second: RunRow) -> int:
-    """How many of two rows are by programs that do not rank."""
+    """Sentence on rows by programs that do not rank."""
     return (not first.is_current) + (not second.is_current)
 
 

@@ -480,7 +480,7 @@ def violations(
     baseline: Outcomes | None = None,
     constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
 ) -> dict[str, float]:
-    """How far each constraint is violated, relatively; <= 0 is fulfilled.
+    """Relative violation of each constraint; <= 0 is fulfilled.
 
     Args:
         spec: The study. One of anything but error alone must not pay for its gain with accuracy:

@@ -87,11 +87,11 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.judgement import StudySummary
 
 _WAIT_S = 2.0
-"""How often a worker without a trial looks whether those of the others have ended."""
+"""Interval at which a worker without a trial looks whether those of the others have ended, seconds."""
 _NAMES_S = 0.2
-"""How often it is looked whether running trials have their workers' names."""
+"""Interval at which it is looked whether running trials have their workers' names, seconds."""
 _BEGINNING_S = 10.0
-"""How long to wait for a worker that is beginning the study on the same storage."""
+"""Seconds to wait for a worker that is beginning the study on the same storage."""
 _PRUNED_AFTER = "pruned_after"
 """User attribute: after how many instances the pruner ended a trial. Optuna's pruner gives its answer once."""
 SUMMARY_FILE = "summary.json"
@@ -215,7 +215,7 @@ class Study(StudyPlan):
 
     @property
     def sampler_name(self) -> str:
-        """Who proposes settings: the spec's sampler, or the class of the one that was given."""
+        """Proposer of settings: the spec's sampler, or the class of the one that was given."""
         sampler = self.study.sampler
         if isinstance(sampler, StreamedSampler):
             return self.spec.sampler
@@ -223,7 +223,7 @@ class Study(StudyPlan):
 
     @property
     def pruner_name(self) -> str:
-        """Who prunes trials: the spec's pruner, or the class of the one that was given."""
+        """Pruner of trials: the spec's, or the class of the one that was given."""
         return type(self._pruner).__name__ if self._has_own_pruner else self.spec.pruner
 
     @property
@@ -233,7 +233,7 @@ class Study(StudyPlan):
 
     @property
     def trials(self) -> int:
-        """How many finished trials the study asks for."""
+        """Number of finished trials that the study asks for."""
         return self.spec.trials + self.extension["trials"]
 
     def extend(self, *, scenes: int = 0, trials: int = 0) -> None:

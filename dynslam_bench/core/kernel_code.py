@@ -40,7 +40,7 @@ NO_CODE = (
     "SHOW_HELP",
     "THREADING",
 )
-"""How those settings of numba begin that do not change what is compiled."""
+"""Beginning of those settings of numba that do not change what is compiled."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
 """Types of values that their `repr` tells completely."""
 

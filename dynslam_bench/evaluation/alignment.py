@@ -142,7 +142,7 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
 
 
 _ROUNDING = 8 * float(np.finfo(np.float64).eps)
-"""How much of a coordinate the rounding of differences may make up."""
+"""Share of a coordinate that the rounding of differences may make up."""
 _ON_A_LINE = 1e-12
 """Share of the first singular value below which the second one says that the positions lie on a line."""
 

@@ -239,7 +239,7 @@ def match(
 
 
 def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
-    """How the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, may be put on one clock."""
+    """Advice on putting the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, on one clock."""
     own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
     # frame numbers on one side
     if are_frame_numbers(own) != are_frame_numbers(true):

@@ -1,4 +1,4 @@
-"""How well a tracker knows its own errors: NEES and 95 % coverage of the covariances of its motions.
+"""Quality of a tracker's knowledge of its own errors: NEES and 95 % coverage of the covariances of its motions.
 
 The error of a motion is the twist ``xi`` (translation in metres, rotation in radians) in
 ``T_true = T_estimated Exp(xi)``, a right perturbation. Its normalised estimation error squared,
@@ -25,7 +25,7 @@ DEGREES = 6
 CHI2_95 = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
 CHI2_MEDIAN = 5.348
-"""Its median."""
+"""Median of chi-square with six degrees of freedom."""
 SYMMETRY = 1e-5
 """Largest difference of a matrix of correlations from its transpose; files have six digits."""
 POSITIVE = 1e-9

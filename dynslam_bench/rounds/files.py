@@ -101,7 +101,7 @@ class Round(RoundRecord):
         ]
 
     def label_of(self, sequence: str, salt: bytes) -> str:
-        """How a scene is named in tables: ``walking_xyz 3``; its id where it is none of the round's."""
+        """Name of a scene in tables: ``walking_xyz 3``; its id where it is none of the round's."""
         ids = self.sequences(salt)
         if sequence not in ids:
             return sequence
@@ -315,7 +315,7 @@ class RoundFolder:
         return self.round.sequences(self.salt)
 
     def entry_file(self, name: str) -> Path:
-        """Where an entry lies."""
+        """Path of an entry."""
         return self.root / "entries" / f"{name}.json"
 
     def entry_names(self) -> list[str]:

@@ -16,7 +16,7 @@ from dynslam_bench.runs.own_code import module_of
 _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 """The part of an absolute path that differs from machine to machine: the round's folder."""
 _OWN_FILES = ("plugin:", "work:")
-"""How names of files begin that lie beside the plug-in or below the round's folder, see `BaseFolders`."""
+"""Beginnings of names of files that lie beside the plug-in or below the round's folder, see `BaseFolders`."""
 _COMMAND_FILES = "the files that its command names"
 _VERSION = "its version"
 

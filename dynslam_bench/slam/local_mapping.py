@@ -457,7 +457,7 @@ class KeyframePolicy:
 
 
 def established_points(slam_map: Map, keyframe: int) -> int:
-    """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
+    """Number of a keyframe's points that `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
     points = slam_map.kf_point[keyframe]
     # keyframes of the submap: a young one has fewer than `ESTABLISHED`
     young = np.count_nonzero(slam_map.kf_alive & (slam_map.kf_map == slam_map.kf_map[keyframe]))

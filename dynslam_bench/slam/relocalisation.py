@@ -469,7 +469,7 @@ def recognise_place(
 def pose_uncertainty(
     slam_map: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
 ) -> float:
-    """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
+    """Uncertainty of the pose by the matches, e.g. those on one distant poster; up to 1 is precise enough.
 
     The number of matches says nothing of that: errors of the map are common to all of them. So they
     have to be well spread, and any half has to give the pose, so that a few far off the others do

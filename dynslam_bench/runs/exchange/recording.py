@@ -33,7 +33,7 @@ from dynslam_bench.slam.map_files import read_ply
 
 RECORDING_FILE = "recording.rrd"
 IMAGE = "world/camera/image"
-"""Where the images are in the recording."""
+"""Path of the images in the recording."""
 LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
 """Layers drawn over the images, with their paths in the recording."""
 _JPEG_QUALITY = 80

@@ -614,7 +614,7 @@ class Collector:
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:
-        """Where a file of that name could lie."""
+        """Places where a file of that name could lie."""
         folders = {os.path.dirname(text), str(self._base_folders.work)}
         if self._base_folders.plugin is not None:
             folders.add(str(self._base_folders.plugin))

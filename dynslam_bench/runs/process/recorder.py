@@ -81,7 +81,7 @@ _IMPORTING = ("<frozen importlib", "<frozen zipimport", os.path.dirname(importli
 _RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
 """These open files by their names in folders that they hold open; the announcement does not tell which folder."""
 _ENVIRONMENT = re.compile(r"/proc/(?:self|\d+)/environ")
-"""Where Linux lists the variables of a process."""
+"""File in which Linux lists the variables of a process."""
 _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")

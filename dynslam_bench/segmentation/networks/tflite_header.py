@@ -142,7 +142,7 @@ class _Table:
         return self.data[first : first + length].decode(errors="replace")
 
     def _vector(self, field: int) -> tuple[int, int]:
-        """Where the elements of a vector begin, and how many there are."""
+        """Offset of the elements of a vector, and their number."""
         at = self._place(field)
         if at is None:
             return 0, 0
@@ -153,7 +153,7 @@ class _Table:
         return start + 4, length
 
     def _place(self, field: int) -> int | None:
-        """Where a field lies; None where it is missing. The table begins with the offset of its list of fields."""
+        """Offset of a field; None where it is missing. The table begins with the offset of its list of fields."""
         fields = self.position - _number(self.data, "i", self.position)
         slot = 4 + 2 * field
         if fields < 0:
