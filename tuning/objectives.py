@@ -419,6 +419,7 @@ def own_objective(cost: Cost) -> Objective:
     name = getattr(cost, "__name__", "own").strip("<>")
 
     def checked(run: Outcome) -> float:
+        """The cost of a run, which must be a number above 0."""
         given: Any = cost(run)
         try:
             value = float(given)

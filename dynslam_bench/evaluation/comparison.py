@@ -139,6 +139,7 @@ LARGEST_M = 1e150
 
 
 def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
+    """Refuse a trajectory with a pose farther away than `LARGEST_M`."""
     sizes = np.abs(trajectory.positions).max(axis=1, initial=0.0)
     if len(sizes) and sizes.max() > LARGEST_M:
         at = int(sizes.argmax())
@@ -292,6 +293,7 @@ def nearest_match(
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
+    """Count the associated poses, and the others by the reason why they have no partner; stamps in seconds."""
     # why a pose has no partner: beyond the ends, in a hole, or another was nearer
     unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)

@@ -282,6 +282,7 @@ def write_stored(
     rows = {row.index: row for row in read_csv(table)} if table.is_file() else {}
 
     def frames() -> Iterator[RecordedFrame]:
+        """The frames of the run, one after the other, with what was stored of each."""
         for index in range(len(sequence)):
             row = rows.get(index)
             frame = sequence[index]

@@ -280,6 +280,7 @@ class ReadRecorder:
     # -- files -------------------------------------------------------------------------------------
 
     def _on_open(self, frame: FrameType, name: Any, mode: str | None, flags: int) -> None:
+        """Note a file that is opened: as read, as made, or both."""
         if isinstance(name, int):  # it was seen when the descriptor was opened
             return
         path = _absolute(name)
@@ -300,6 +301,7 @@ class ReadRecorder:
         self._make(path)
 
     def _on_missing(self, frame: FrameType, name: Any) -> None:
+        """Note a file that foreign code looked for and that is not there."""
         path = None if isinstance(name, int) else _absolute(name)
         if path is None or path in self._notes.missing or not self._counts_by_itself(path):
             return
@@ -309,10 +311,12 @@ class ReadRecorder:
         self._note("missing", path)
 
     def _on_map(self, frame: FrameType, descriptor: int, *_: Any) -> None:
+        """Note a file that is mapped into memory as read."""
         if path := _absolute(descriptor):
             self._read(frame, path)
 
     def _on_database(self, frame: FrameType, name: Any) -> None:
+        """Note an SQLite file as read and as made."""
         text = os.fsdecode(name)
         if text.startswith("file:"):  # a URI, with options behind a question mark
             text = text.removeprefix("file:").partition("?")[0]
@@ -321,6 +325,7 @@ class ReadRecorder:
             self._make(path)
 
     def _on_library(self, frame: FrameType, name: Any) -> None:
+        """Note a library that is loaded as read."""
         # one without a folder is found among what is mapped into memory
         if not isinstance(name, str | bytes) or os.sep not in os.fsdecode(name):
             return
@@ -419,6 +424,7 @@ class ReadRecorder:
     def _on_rename(
         self, frame: FrameType, source: Any, target: Any, source_folder: int, target_folder: int
     ) -> None:
+        """Note a renamed file as read under its old name and as made under both; a made folder stays one."""
         if path := _absolute(source, source_folder):
             self._read(frame, path)
             self._make(path)
@@ -440,12 +446,14 @@ class ReadRecorder:
             self._make(path)
 
     def _on_mkdir(self, _: FrameType, name: Any, __: int, folder: int) -> None:
+        """Note a new folder: what lies in it was made by the run."""
         path = _absolute(name, folder)
         if path is not None and not os.path.lexists(path):
             self._make(path)
             self._notes.made_folders += (f"{path}{os.sep}",)
 
     def _on_list(self, frame: FrameType, name: Any) -> None:
+        """Note the names in a folder that foreign code lists."""
         path = _absolute("." if name is None else name)
         if path is None or path in self._notes.folders or not is_file_name(path):
             return
@@ -462,6 +470,7 @@ class ReadRecorder:
     # -- modules and variables ---------------------------------------------------------------------
 
     def _on_import(self, frame: FrameType, module: str, *_: Any) -> None:
+        """Note a module that foreign code imports, by its top-level name."""
         top = module.partition(".")[0]
         if top in self._notes.modules or top in sys.stdlib_module_names:
             return
@@ -490,6 +499,7 @@ class ReadRecorder:
         self._note_variables(self._collector.environment)
 
     def _note_variables(self, names: Iterable[str]) -> None:
+        """Note environment variables that count and were not noted yet."""
         for name in names:
             is_known = name in self._notes.variables or f"${name}" in self._notes.made
             if is_counted(name) and name not in SEARCH_PATHS and not is_known:
@@ -501,6 +511,7 @@ class ReadRecorder:
     def _on_popen(
         self, frame: FrameType, executable: Any, words: Any, folder: Any, environment: Any
     ) -> None:
+        """Note a program that is started, and the variables that an adapter gives it."""
         given = [words] if isinstance(words, str | bytes | os.PathLike) else list(words)
         self._start_program(frame, [executable, *given[1:]], folder)
         # an adapter's program gets these variables and no others
