@@ -42,8 +42,6 @@ _METADATA = (".dist-info", ".egg-info")
 """How the names of folders end that hold a distribution's metadata."""
 _NOT_CONTENT = ("..", ".pyc", ".dist-info")
 """Lines of a distribution's RECORD with these differ between installations of the same files."""
-_FIRST_PART = re.compile("^[^/,\\n]+", re.MULTILINE)
-"""The first folder, or the file itself, of each line of a RECORD."""
 _SUFFIXES = tuple(importlib.machinery.all_suffixes())
 """How files end that Python imports as modules."""
 
@@ -387,7 +385,10 @@ def _top_level_names(metadata: str) -> set[str]:
 
 def _first_parts(record: Path) -> set[str]:
     """The names of the modules that lie where the files of a RECORD begin."""
-    parts = set(_FIRST_PART.findall(record.read_text(encoding="utf-8", errors="replace")))
+    # the first folder, or the file itself, of each line
+    lines = record.read_text(encoding="utf-8", errors="replace").split("\n")
+    parts = {line.partition("/")[0] for line in lines}
+    parts = {part.partition(",")[0] for part in parts}
     modules = {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)}
     return modules - {"", BYTE_CODE_FOLDER}
 
