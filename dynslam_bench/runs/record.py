@@ -61,11 +61,14 @@ def digest_of_request(identity: Mapping[str, Any]) -> str:
     return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
 
+def digest_of_reads(identity: Mapping[str, Any]) -> str:
+    """The last eight digits of a run's id: what was read for it, which is all that was not asked for."""
+    return digest({name: value for name, value in identity.items() if name not in ASKED}, 8)
+
+
 def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
-    # all that was not asked for was read
-    read = {name: value for name, value in identity.items() if name not in ASKED}
-    return digest_of_request(identity) + digest(read, 8)
+    return digest_of_request(identity) + digest_of_reads(identity)
 
 
 def coverage_text(coverage: float | None) -> str:
