@@ -190,7 +190,7 @@ def render(sequences: set[str]) -> None:
 
 
 def culling_effect(rows: Iterable[RunRow]) -> list[str]:
-    """What the runs show: a sentence on the effect of culling for each sequence, and the weight of single runs."""
+    """Sentences on the effect of culling, one a sequence, and on the weight of single runs."""
     # errors in metres by sequence and tracker; a name is `walking_xyz?scene=1`, without the frames
     errors: dict[str, dict[str, float]] = defaultdict(dict)
     for row in rows:

@@ -121,6 +121,8 @@ class MaskScheduler:
         """Forget the masks of the previous sequence."""
         self.wait_for_segmenter()
         self._missed.reset()
+        if isinstance(self.segmenter, ConfiguredSegmenter):
+            self.segmenter.reset()
         self._instances = Instances.empty(0, 0)
         self._gray = np.zeros((0, 0), np.uint8)
         self._age = 0
@@ -404,18 +406,19 @@ ROUND_TRIP_PX = 1.0
 """Largest forward-backward error of a corner that is used."""
 
 
-def dense_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
+def dense_flow(previous: Gray, current: Gray, work_side: int = WORK_SIDE) -> NDArray[np.float32]:
     """Dense flow from the previous image to the current one, by DIS (Kroeger et al. 2016).
 
     Args:
         previous: uint8 ``[H, W]``.
         current: uint8 ``[H, W]``.
+        work_side: Shorter side of the images that it is computed on, pixels.
 
     Returns:
         float32 ``[h, w, 2]`` at the reduced size and in its pixels.
     """
     height, width = current.shape
-    ratio = min(1.0, WORK_SIDE / min(height, width))
+    ratio = min(1.0, work_side / min(height, width))
     size = (max(16, round(width * ratio)), max(16, round(height * ratio)))
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (previous, current)]
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)

@@ -66,7 +66,7 @@ PRELOADED = (
     "dynslam_bench.trackers.registry",
     "dynslam_bench.sequences.synthetic.sequence",
 )
-"""What the server imports before it forks."""
+"""Modules that the server imports before it forks."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 _CLOSE_S = 10.0

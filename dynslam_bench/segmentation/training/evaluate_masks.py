@@ -258,7 +258,10 @@ def evaluate_segmenter(
     """
     # detections down to a low score, which the precision-recall curve needs
     images = open_labelled(data)
-    low = settings.model_copy(update={"confidence": min(LEAST_SCORE, settings.confidence)})
+    # images of a set do not follow each other, so that nothing is carried from one to the next
+    low = settings.model_copy(
+        update={"confidence": min(LEAST_SCORE, settings.confidence), "map_decay": 0.0}
+    )
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
