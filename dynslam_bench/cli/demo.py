@@ -67,7 +67,7 @@ def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 60,
     jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 5,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
     from functools import partial
@@ -99,7 +99,7 @@ def demo(
     )
 
     note("making the report")
-    paths = report(store.root, title="Demo: walking and sitting people, rendered")
+    paths = report(store.root, title="Demo: walking people and a balloon, rendered")
 
     tuned = tune_small_study(study, store.root / "study", jobs)
     show_outcome(store, paths, tuned)
