@@ -40,7 +40,7 @@ class Findings(NamedTuple):
     """What both sides show after some rounds.
 
     Attributes:
-        verdict: Verdict on the error.
+        verdict: Verdict on the error alone.
         estimate: Mean log ratio with its interval; None where nothing could be compared.
         level: Two-sided level of the interval.
         lost: Runs that the candidate lost, and the baseline.
@@ -56,6 +56,12 @@ class Findings(NamedTuple):
     cases: list[CaseResult]
     guardrails: list[GuardrailResult]
     exit_code: int
+
+    @property
+    def overall(self) -> GateVerdict:
+        """The verdict on error and guardrails: nothing that does not pass is called by the name of a pass."""
+        by_code = {REGRESSED: GateVerdict.REGRESSED, UNDECIDED: GateVerdict.UNDECIDED}
+        return by_code.get(self.exit_code, self.verdict)
 
     @property
     def is_settled(self) -> bool:
@@ -121,7 +127,7 @@ def judge(
 
     rows = _case_results(baseline, candidate, cases, rounds, ratios)
     guardrails = _guardrails(baseline, candidate, config, rounds, level, timed=timed)
-    code = _exit_code(verdict, guardrails, counts, all_lost=bool(all_lost))
+    code = _exit_code(verdict, guardrails, counts, all_lost=bool(all_lost), timed=timed)
     return Findings(verdict, estimate, level, counts, rows, guardrails, code)
 
 
@@ -131,6 +137,7 @@ def _exit_code(
     lost: tuple[int, int],
     *,
     all_lost: bool,
+    timed: bool,
 ) -> int:
     is_broken = any(guardrail.state == "broken" for guardrail in guardrails)
     if all_lost:
@@ -139,7 +146,9 @@ def _exit_code(
         return REGRESSED
     if verdict is GateVerdict.UNDECIDED and lost[0] > lost[1]:
         return RUNS_FAILED
-    is_open = any(guardrail.state == "open" for guardrail in guardrails)
+    # runs in turns that do not tell their times leave a limit on them open
+    unknown = ("open", "not measured") if timed else ("open",)
+    is_open = any(guardrail.state in unknown for guardrail in guardrails)
     return UNDECIDED if verdict is GateVerdict.UNDECIDED or is_open else PASSED
 
 
@@ -274,7 +283,7 @@ def _paired(
     ratios = np.log(values) - np.log(values_baseline)
     ratios = ratios[np.isfinite(ratios).all(axis=1)]
     if not len(ratios):
-        text = f"{name} is not known"
+        text = f"{name} is not known: these runs do not tell it, so take the guardrail out"
         return GuardrailResult(name=name, state="not measured", limit=limit, text=text)
     estimate = mean_ratio(np.clip(ratios, -CLIP, CLIP), level)
     edge = math.log(limit)
