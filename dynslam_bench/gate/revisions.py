@@ -34,8 +34,10 @@ def git(folder: Path, *arguments: str) -> str:
     with translate_errors(RunError, "git cannot be started", "install git"):
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode != 0:
-        words = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
-        raise RunError(f"git {arguments[0]}: {words[-1]}")
+        lines = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
+        # advice may follow the fault
+        fatal = [line for line in lines if line.startswith("fatal:")]
+        raise RunError(f"git {arguments[0]}: {(fatal or lines)[-1]}")
     return ended.stdout.strip()
 
 
