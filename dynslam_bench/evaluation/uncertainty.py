@@ -38,7 +38,7 @@ LONGEST_GAP_S = 0.1
 LARGEST_NEES = 1e12
 """A larger NEES counts as this: means stay numbers, however small a variance is."""
 FAR_OFF = 100.0
-"""A mean NEES / 6 this far from 1, above or below, is stated with the factor that would mend it."""
+"""A mean NEES of translation or rotation over its three degrees this far from 1 is stated, with its factor."""
 UNITS = {
     "translation": {1e3: "millimetres", 1e2: "centimetres"},
     "rotation": {180 / np.pi: "degrees"},
@@ -187,26 +187,33 @@ class _Motions:
 
     def doubts(self) -> list[str]:
         """One line where the covariances are far off, with the factor and the unit that it suggests."""
-        ratio = float(nees(self.errors, self.covariances).mean()) / DEGREES
-        if 1 / FAR_OFF <= ratio <= FAR_OFF:
-            return []
+        ratio = _mean_nees(self.errors, self.covariances) / DEGREES
         parts = []
         for name, part in (("translation", slice(0, 3)), ("rotation", slice(3, 6))):
-            of_part = nees(self.errors[:, part], self.covariances[:, part, part])
-            factor = float(np.sqrt(3 / max(of_part.mean(), np.finfo(float).tiny)))
-            unit = next(
-                (
-                    f", as in {unit}"
-                    for size, unit in UNITS[name].items()
-                    if size / UNIT_TOLERANCE <= factor <= size * UNIT_TOLERANCE
-                ),
-                "",
-            )
-            parts.append(f"standard deviations of {name} are {factor:.3g} x the errors{unit}")
+            of_part = _mean_nees(self.errors[:, part], self.covariances[:, part, part]) / 3
+            if not 1 / FAR_OFF <= of_part <= FAR_OFF:
+                factor = 1 / np.sqrt(max(of_part, np.finfo(float).tiny))
+                unit = _unit_of(factor, UNITS[name])
+                parts.append(f"standard deviations of {name} are {factor:.3g} x the errors{unit}")
+        if not parts:
+            return []
         return [
             f"the covariances do not fit the errors: NEES / 6 is {ratio:.3g} over one frame, 1 is right; "
             f"{'; '.join(parts)}; metres and radians are expected, translation first"
         ]
+
+
+def _unit_of(factor: float, units: dict[float, str]) -> str:
+    """The unit that would explain standard deviations so many times too large, in words; empty for none."""
+    for size, unit in units.items():
+        if size / UNIT_TOLERANCE <= factor <= size * UNIT_TOLERANCE:
+            return f", as in {unit}"
+    return ""
+
+
+def _mean_nees(errors: Array, covariances: Array) -> float:
+    """Mean NEES, none of them counting for more than `LARGEST_NEES`."""
+    return float(np.minimum(nees(errors, covariances), LARGEST_NEES).mean())
 
 
 def nees(errors: Array, covariances: Array) -> Array:
