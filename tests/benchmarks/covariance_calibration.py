@@ -3,10 +3,10 @@
     python tests/benchmarks/covariance_calibration.py --record ./excerpts/rgbd_dataset_freiburg1_xyz
 
 A clip's own factor makes the median NEES of its motions from frame to frame that of chi-square. The fitted factor is
-the median of these over all clips of the fit (it contains the `COVARIANCE_FACTOR` of the code that made them); its spread
-are their 10 % and 90 % quantiles. A row of the table has the factor fitted without its family, the clip's own, and with
-the former NEES / 6 (mean, and median over chi-square's) and the share within the 95 % ellipsoid over one frame and one
-second; 1, 1 and 95 % are right. Recordings count the noise of their truth.
+the median of these over all clips of the fit (it contains the `COVARIANCE_FACTOR` of the code that made them); its
+spread are their 10 % and 90 % quantiles. A row of the table has the factor fitted without its family, the clip's own,
+and with the former NEES / 6 (mean, and median over chi-square's) and the share within the 95 % ellipsoid over one frame
+and one second; 1, 1 and 95 % are right. Recordings count the noise of their truth.
 """
 
 import one_thread  # noqa: F401  # before all others
