@@ -301,16 +301,16 @@ def _interpolated(truth: Trajectory, stamps: Array) -> tuple[Array, NDArray[np.b
         return poses, np.zeros(len(stamps), bool)
     after = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
     gaps = times[after] - times[after - 1]
-    known = (stamps >= times[0]) & (stamps <= times[-1]) & (gaps <= LONGEST_GAP_S)
+    has_pose = (stamps >= times[0]) & (stamps <= times[-1]) & (gaps <= LONGEST_GAP_S)
     # a stamp that has a true pose needs no neighbour
     nearest = np.where(stamps - times[after - 1] < times[after] - stamps, after - 1, after)
-    known |= np.abs(times[nearest] - stamps) <= 1e-6
+    has_pose |= np.abs(times[nearest] - stamps) <= 1e-6
 
     at = np.clip(stamps, times[0], times[-1])
     rotation = Slerp(times, Rotation.from_matrix(truth.T_world_cam[:, :3, :3]))(at).as_matrix()
     places = np.stack([np.interp(at, times, axis) for axis in truth.positions.T], axis=1)
-    poses[known] = se3.from_matrix(places, rotation)[known]
-    return poses, known
+    poses[has_pose] = se3.from_matrix(places, rotation)[has_pose]
+    return poses, has_pose
 
 
 def _pairs_over_a_second(

@@ -113,7 +113,7 @@ def test_maps_move_with_the_image():
     assert joined.max() == pytest.approx(0.5, abs=0.02)
     columns = joined[0, 30] > 0.25
     assert np.flatnonzero(columns)[[0, -1]] == pytest.approx([22, 31], abs=1)
-    # two frames later it counts a quarter of that; an earlier frame begins anew
+    # two frames later it counts a quarter of that; an earlier frame begins a sequence
     assert carried.join(np.zeros_like(maps), second, 8).max() == pytest.approx(0.125, abs=0.02)
     assert carried.join(np.zeros_like(maps), second, 2).max() == 0
 
