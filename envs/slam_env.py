@@ -324,7 +324,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What an adapter of this package measured of its program, and its ``notes``; empty for other trackers."""
+        """Measurements of its program and ``notes`` by an adapter of this package; empty for other trackers."""
         if not self.tracker_spec.entry_point.startswith("dynslam_bench."):
             return {}
         return dict(getattr(self._tracker, "measured", {}))

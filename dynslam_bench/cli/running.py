@@ -485,7 +485,7 @@ class WatchedRuns:
         self.reused: set[str] = set()
         self.faults: set[str] = set()
         # frames of all runs that are made, of those that have ended, and of running ones
-        self._planned = runs.Plan()
+        self._planned = runs.PlannedRuns()
         self._done = 0
         self._running: dict[str, int] = {}
         self._ended_runs = 0
@@ -513,7 +513,7 @@ class WatchedRuns:
         done = self._done + sum(self._running.values())
         self._advance(done, self._planned.frames.total() or None, step)
 
-    def _plan(self, plan: runs.Plan) -> None:
+    def _plan(self, plan: runs.PlannedRuns) -> None:
         self._planned = plan
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
@@ -574,7 +574,7 @@ def event_text(event: runs.RunEvent) -> str:
     return f"{text}, writing {', '.join(files)}"
 
 
-def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
+def describe_plan(plan: runs.PlannedRuns, store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
     from dynslam_bench.core.fingerprint import this_machine  # loads numpy
 

@@ -65,7 +65,7 @@ COLUMNS = {
     "from the store": "from_store",
     "study": "study",
 }
-"""Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+"""Headings of the table, the most important first, and the names of what stands below them (see `make_run_row`)."""
 _IN_METRES = ("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m")
 """Errors of a row in metres, which are shown in millimetres."""
 MOST_REMARKS = 10
@@ -82,7 +82,7 @@ COLOURS = {
     "invalid": 31,
 }
 """Colours of the statuses on a terminal, as ANSI codes."""
-# Columns that `runs list` sorts by, and the names of those in a row that differ (see `run_row`).
+# Columns that `runs list` sorts by, and the names of those in a row that differ (see `make_run_row`).
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
@@ -400,13 +400,13 @@ def show_runs(
         reused: Ids of the runs that are marked as taken from the store.
 
     Returns:
-        The table's rows, see `run_row`.
+        The table's rows, see `make_run_row`.
     """
     rows = []
     for record in records:
         # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
-        rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
+        rows.append(stored.make_run_row(record, metrics) | {"from_store": record.run_id in reused})
     if len(rows) == 1 and not json_mode():
         show_run(rows[0], store)
     else:
@@ -497,7 +497,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    """Lines below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")

@@ -51,7 +51,7 @@ def space(
     study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False
 ) -> None:
     """Show which settings a study tunes, what its scenes could show, and how long it takes."""
-    plan = tuning.Plan(tuning.read_study(study), results)
+    plan = tuning.StudyPlan(tuning.read_study(study), results)
     preview = plan.preview(jobs)
 
     rows = []

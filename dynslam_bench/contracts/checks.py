@@ -1,4 +1,4 @@
-"""What is demanded of a tracker's results: written once, for the environment and for the conformance suite.
+"""Checks of a tracker's results: written once, for the environment and for the conformance suite.
 
 A *fault* makes a run ``invalid``: the environment refuses the result. A *blemish* is refused by the
 conformance suite only: no number is wrong because of it.
@@ -78,7 +78,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with something that was returned.
+    """Fault of a returned value.
 
     Attributes:
         found: What was returned, to be read after "returned".
@@ -90,7 +90,7 @@ class Fault:
 
 
 def faults(result: object, frame: Frame) -> Iterator[Fault]:
-    """What makes a result invalid: its type, state, pose, numbers, keypoints, or a mask of another size than the image.
+    """Faults that make a result invalid: type, state, pose, numbers, keypoints, or a mask of another size.
 
     Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
     """
@@ -129,7 +129,7 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
 
 
 def _keypoint_faults(result: TrackResult) -> Iterator[Fault]:
-    """What is wrong with the keypoints' pixels, or with which of them were kept."""
+    """Faults of the keypoints' pixels, or of the flags of those that were kept."""
     xy: Any = result.keypoints_xy
     keep = result.keypoints_keep
     if xy is not None and not _is_number_array(xy, columns=2):
@@ -142,7 +142,7 @@ def _keypoint_faults(result: TrackResult) -> Iterator[Fault]:
 
 
 def blemishes(result: TrackResult) -> Iterator[Fault]:
-    """What is wrong with a result that has no faults, in values that no metric is made of."""
+    """Faults of a valid result in values that no metric is made of: stats, timings, mask."""
     for name, values in (("stats", result.stats), ("timings", result.timings)):
         bad = {key: value for key, value in values.items() if not _is_number(value)}
         if bad:
@@ -172,7 +172,7 @@ def _covariance_blemishes(value: object) -> Iterator[Fault]:
 
 
 def trajectory_faults(trajectory: object) -> Iterator[Fault]:
-    """What makes a final trajectory invalid: its type, or a pose that is no rigid transformation."""
+    """Faults that make a final trajectory invalid: its type, or a pose that is no rigid transformation."""
     if not isinstance(trajectory, Trajectory):
         yield Fault(f"a {type(trajectory).__name__}, not a Trajectory")
         return
@@ -252,7 +252,7 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
 
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
-    """What is wrong with a camera-to-world pose: its shape, type, numbers, or that it is no rigid transformation."""
+    """Faults of a camera-to-world pose: shape, type, numbers, or that it is no rigid transformation."""
     if not isinstance(pose, np.ndarray):
         yield Fault(f"a {type(pose).__name__} as pose, expected a 4x4 matrix")
     elif pose.shape != (4, 4):

@@ -1,4 +1,4 @@
-"""What a result was made of: digests of code, weights, machine and content.
+"""Identity of what a result was made of: digests of code, weights, machine and content.
 
 Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of
 what plug-ins read (`core.reads`): where anything of it differs, so does the id.

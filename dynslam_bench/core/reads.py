@@ -1,4 +1,4 @@
-"""What foreign code read while a run was made, and whether it is still the same.
+"""Files, variables and modules that foreign code read while a run was made, and whether they are still the same.
 
 A run is valid as long as all that it read is unchanged. `runs.process.recorder` records what
 plug-ins and programs read. This module holds the record (`Reads`) and compares it with what is
@@ -57,7 +57,7 @@ Entries = Annotated[dict[str, str], AfterValidator(_sorted)]
 
 
 class Reads(Record):
-    """What foreign code read, by name; the digest `ABSENT` stands for what was not there.
+    """Digests of what foreign code read, by name; `ABSENT` stands for what was not there.
 
     Names of files begin in the folders of `BaseFolders`.
 

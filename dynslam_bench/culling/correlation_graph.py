@@ -156,7 +156,7 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
         observed: NDArray[np.bool_],
         edges: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
-        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed.
+        """Flags ``[E]`` of edges that keep their vector since the oldest frame in which both ends were observed.
 
         Args:
             current: World positions and covariances ``[N, 3 + 9]`` of this frame's points.
@@ -187,7 +187,7 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
     def _static_component(
         self, edges: NDArray[np.intp], points: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], int]:
-        """Which points ``[N]`` are in the largest component of the edges ``[E, 2]``, and the number of components."""
+        """Flags ``[N]`` of points in the largest component of the edges ``[E, 2]``, and the number of components."""
         graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(points), len(points)))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)

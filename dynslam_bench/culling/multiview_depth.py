@@ -175,7 +175,7 @@ def hidden(
     tau: float,
     radius: int,
 ) -> NDArray[np.bool_]:
-    """Which points are hidden by a nearer object, robustly against small projection errors.
+    """Flag points that a nearer object hides, robustly against small projection errors.
 
     A point is compared with the depth in the window that is nearest to the expected depth, among
     those in front of it. So a point beside an object is not hidden, only one well inside its

@@ -128,7 +128,7 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
     def _moving_clusters(
         self, residual: NDArray[np.float64], label: NDArray[np.intp], people: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Which clusters move, ``[K]``: posterior of the two-component mixture above the threshold."""
+        """Flags ``[K]`` of moving clusters: posterior of the two-component mixture above the threshold."""
         count = self.settings.clusters
         measured = np.isfinite(residual)
         if not measured.any():

@@ -105,7 +105,12 @@ class RigidMotionFilter(BaseFilter[RigidMotionSettings]):
     def _test(
         self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
+        """Compare K tested points with the camera's motion.
+
+        Returns:
+            Flags ``[K]`` of points that fail now, residuals ``[K, 2]`` in pixels, and additions
+            ``[K]`` to the threshold in pixels.
+        """
         assert state.flow is not None
         assert state.previous is not None
 

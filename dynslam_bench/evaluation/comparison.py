@@ -419,7 +419,7 @@ STAMP_TOLERANCE = 1e-3
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
-    """Which input frames ``[N]`` have a pose in the estimate.
+    """Flags ``[N]`` of input frames that have a pose in the estimate.
 
     A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some
     systems write the depth image's stamp, and files round.

@@ -30,7 +30,7 @@ from dynslam_bench.evaluation.uncertainty import (
     Uncertainty,
     motion_uncertainty,
 )
-from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory, load_trajectory
 from dynslam_bench.geometry.motion_covariances import MotionCovariances
 
 SCHEMA_VERSION = 1
@@ -212,7 +212,7 @@ def evaluate_files(
 
 
 def evaluate_loaded(
-    estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str
+    estimate: LoadedTrajectory, ground_truth: LoadedTrajectory, protocol: Protocol | str
 ) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 

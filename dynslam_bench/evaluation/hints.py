@@ -66,7 +66,7 @@ def hints(
     *,
     notes: FileNotes | None = None,
 ) -> tuple[Hint, ...]:
-    """What is probably wrong with an estimate, from its comparison with the truth.
+    """Find what is probably wrong with an estimate, by comparing it with the truth.
 
     Args:
         estimate: Camera-to-world poses, as they were read.
@@ -448,7 +448,7 @@ class Track:
         return poses
 
     def nearest(self, stamps: Array) -> NDArray[np.intp]:
-        """Which poses are nearest in time ``[N]``."""
+        """Indices ``[N]`` of the poses nearest in time."""
         after = np.searchsorted(self.stamps, stamps).clip(1, len(self.stamps) - 1)
         return np.asarray(after - (stamps - self.stamps[after - 1] < self.stamps[after] - stamps))
 

@@ -182,7 +182,7 @@ class DenseDaisyFlow:
         )
 
     def _consistent(self, forward: Floats, backward: Floats) -> Flags:
-        """Which pixels the backward flow leads back to, bool ``[H, W]``; see `consistent`."""
+        """Flags ``[H, W]`` of the pixels that the backward flow leads back to; see `consistent`."""
         valid = np.empty(forward.shape[:2], dtype=np.bool_)
         tolerance = np.float32(self.settings.consistency_px)
         self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)

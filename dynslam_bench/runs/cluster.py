@@ -30,7 +30,7 @@ _FIELDS_OF_KIND = (
     "offset",
     "stride",
 )
-"""What of a `RunSpec` decides whether a host can make it: runs that are equal in these are of one kind."""
+"""Fields of a `RunSpec` that decide whether a host can make it: runs that are equal in these are of one kind."""
 _COUNT_SLOTS_EVERY_S = 5.0
 """Seconds between two looks at the workers that there are."""
 
@@ -73,7 +73,7 @@ class DaskWorkers(Executor):
     def describe(
         self, sequences: Sequence[str], data_root: str | None = None
     ) -> list[dict[str, object]]:
-        """What each worker has, as rows of a table; one that does not know this package gets no runs.
+        """Describe each worker as a row of a table; one that does not know this package gets no runs.
 
         Args:
             sequences: Ids or folders that runs will need.

@@ -1,4 +1,4 @@
-"""What makes two runs the same run: what was asked for, and what was read for it.
+"""Identity of a run: what was asked for, and what was read for it.
 
 A run's id has twelve digits of what was asked for and eight of what was read. A stored run is taken
 again while all that was read for it is unchanged.
@@ -249,7 +249,7 @@ class Resolver:
     def _named_files(
         self, configured: _Configuration, source: str
     ) -> tuple[dict[str, Any], tuple[Path, ...]]:
-        """What `_files_of` gives, looked up once for a tracker with its settings and a source of masks."""
+        """Look up the result of `_files_of` once for a tracker with its settings and a source of masks."""
         key = (configured.key, source)
         if key not in self._files:
             self._files[key] = _files_of(configured.tracker, configured.settings, source)
@@ -258,7 +258,7 @@ class Resolver:
     def _named_components(
         self, configured: _Configuration, source: str, sequence: Sequence, *, changes_frames: bool
     ) -> tuple[list[str], BaseFolders]:
-        """What a run is made of, by the names of its identity, and where the names of files begin.
+        """Components of a run by the names of its identity, and the folders in which the names of files begin.
 
         Looked up once for a tracker with its settings, a source of masks and a kind of sequence;
         see `components_of_run`.
@@ -378,7 +378,7 @@ def _files_of(
 
 
 def libraries() -> dict[str, str]:
-    """What computes with a run's data: versions of the modules that are imported, and what comes before them."""
+    """Versions of the modules that compute with a run's data, and the paths that are searched before them."""
     imports = ImportPath(sys.path)
     identities = {name: library_identity(module, imports) for name, module in LIBRARIES.items()}
     return identities | search_path()

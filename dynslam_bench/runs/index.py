@@ -1,4 +1,4 @@
-"""What was computed from the runs of a store, in one SQLite file that may be deleted at any time."""
+"""Index of what was computed from the runs of a store, in one SQLite file that may be deleted at any time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LOCKED_S = 10.0
 
 
 class RunIndex:
-    """What was computed from the runs of a store: metrics, rows of lists and rows of reports, in one SQLite file.
+    """Values computed from the runs of a store: metrics, rows of lists and rows of reports, in one SQLite file.
 
     Each value holds for one version of the code that computed it and for one state (times and
     sizes) of the files that it was computed from. The file may be deleted at any time; values that

@@ -46,7 +46,7 @@ FIELDS = (
 """Names of the values of a list's row, in order."""
 
 
-def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
+def make_run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
     """A run's row in a list: JSON values under the names `FIELDS`.
 
     Args:
@@ -91,7 +91,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
 
 
 def _remarks(record: RunRecord, metrics: MetricRecord | None) -> list[str]:
-    """What to know before the numbers are believed: of the recording, then of the errors."""
+    """Warnings on the recording, then remarks on the errors, one a line."""
     of_recording = [f"warning: {note}" for note in record.notes if note.startswith(ON_RECORDING)]
     return [*of_recording, *([] if metrics is None else metrics.remarks)]
 
@@ -114,7 +114,7 @@ def _reason(record: RunRecord, metrics: MetricRecord | None) -> str:
 
 
 def part_words(record: RunRecord) -> str:
-    """Which frames of its sequence a run was asked for, e.g. ``0:60, every 2nd``; empty for all of them."""
+    """Part of its sequence that a run was asked for, e.g. ``0:60, every 2nd``; empty for all frames."""
     words = []
     if record.frames is not None:
         start, stop = record.frames
@@ -220,7 +220,7 @@ def _cells(record: RunRecord, metrics: MetricRecord | None) -> Row:
     # columns of the same name as a field of the record, then those of the list, then the others
     columns = (*_INTEGER_COLUMNS, *_FLOAT_COLUMNS, *_TEXT_COLUMNS)
     cells = {name: getattr(record, name) for name in columns if hasattr(record, name)}
-    cells |= run_row(record, metrics)
+    cells |= make_run_row(record, metrics)
     cells["label"] = record.tracker.label or record.tracker.id
     cells["provenance"] = record.tracker.provenance
     cells["split"] = record.sequence.split

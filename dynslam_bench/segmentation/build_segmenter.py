@@ -126,7 +126,7 @@ def resolve_source(
     *,
     optional: bool = False,
 ) -> str:
-    """What `settings.source` means for a sequence; the label stored with results.
+    """Resolve `settings.source` for a sequence to the label that is stored with results.
 
     Args:
         settings: The settings with the source.

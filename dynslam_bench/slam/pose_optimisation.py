@@ -140,12 +140,14 @@ def cauchy_width(chi2: Array) -> float:
     Their variance over the assumed one is estimated by the median of those that are finite (of
     points in front of the camera).
     """
+    # chi-squares of points in front of the camera
     finite = np.empty(len(chi2))
     count = 0
     for value in chi2:
         if np.isfinite(value):
             finite[count] = value
             count += 1
+    # the median is robust against outliers: it exceeds that of pure noise as the variance does
     if count == 0:
         return CAUCHY
     return CAUCHY * max(median(finite[:count]) / MEDIAN_CHI2, LEAST_VARIANCE)
@@ -266,13 +268,16 @@ def observation_chi2(
     camera: Intrinsics,
 ) -> tuple[float, float]:
     """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
+    # the point in the camera frame
     x, y, z = transform_point(pose, point)
     if z < NEAR_M:
         return np.inf, np.inf
+    # residuals of the pixel, weighted by their information
     u = camera.fx * x / z + camera.cx
     du = uv[0] - u
     dv = uv[1] - (camera.fy * y / z + camera.cy)
     pixel = info * (du * du + dv * dv)
+    # with depth the right coordinate, u less the disparity, counts, too
     if info_right <= 0.0:
         return pixel, pixel
     dr = right - (u - camera.bf / z)
@@ -293,6 +298,7 @@ def _classify(
     Returns how many fit.
     """
     count = 0
+    # chi-square tests at 95 %, with two degrees of freedom or, with depth, three
     for i in range(points.shape[0]):
         pixel, whole = observation_chi2(
             pose,
@@ -319,6 +325,7 @@ def _optimise(
     iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:
     """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``."""
+    # every point is an inlier at first
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))
     chi2 = np.empty(len(points))
@@ -331,6 +338,8 @@ def _optimise(
             for i in range(len(points)):
                 chi2[i] = error[i] * error[i] if inlier[i] else np.inf
             width = cauchy_width(chi2)
+
+        # Levenberg-Marquardt on the inliers of the last round
         damping = DAMPING
         cost = _linearise(pose, points, measured, inlier, width, camera, h, g)
         for _ in range(iterations):
@@ -370,24 +379,18 @@ def _optimise(
 def optimise_pose(
     T_cam_world: Array,
     points: Array,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
+    measured: Measurements,
     camera: Camera,
     *,
     rounds: int = 4,
     iterations: int = 6,
 ) -> PoseEstimate:
-    """The world-to-camera pose that fits the points to the pixels, and which of them fit.
+    """Fit the world-to-camera pose to the pixels of known points, and tell which of them fit.
 
     Args:
         T_cam_world: Where to start ``[4, 4]``.
         points: World points ``[N, 3]``, metres.
-        uv: Undistorted pixels ``[N, 2]``.
-        right: Right coordinates ``[N]``; ignored where `info_right` is 0.
-        info: Inverse variances of the pixels ``[N]``, 1/px^2.
-        info_right: Inverse variances of the right coordinates ``[N]``, 0 without depth.
+        measured: Where the image shows them.
         camera: Intrinsics and baseline.
         rounds: Optimisations, each followed by a new sorting into inliers and outliers.
         iterations: Gauss-Newton steps a round at most.
@@ -397,12 +400,13 @@ def optimise_pose(
     """
     if len(points) < MIN_POINTS:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
+    # compiled loops take contiguous arrays
     start = np.ascontiguousarray(T_cam_world, np.float64)
-    measured = Measurements(*map(np.ascontiguousarray, (uv, right, info, info_right)))
+    contiguous = Measurements(*map(np.ascontiguousarray, measured))
     pose, inliers, error, h = _optimise(
         start,
         np.ascontiguousarray(points),
-        measured,
+        contiguous,
         intrinsics_of(camera),
         rounds,
         iterations,

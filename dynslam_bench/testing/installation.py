@@ -1,4 +1,4 @@
-"""What is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
+"""Report on what is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
 
 import platform
 import re
@@ -131,7 +131,7 @@ def _weights() -> list[Finding]:
 
 
 def _torch_device() -> Finding:
-    """Which device ``--device auto`` takes; loads torch, which takes a second or two."""
+    """Find the device that ``--device auto`` takes; loads torch, which takes a second or two."""
     import torch
 
     device = f"cpu, {torch.get_num_threads()} processor threads"

@@ -67,7 +67,7 @@ _MEMBERS = (
     "digest",
     "__len__",
 )
-"""What a sequence has beside its frames."""
+"""Members that a sequence has beside its frames."""
 
 
 def _protocol(sequence: Sequence) -> None:

@@ -508,7 +508,7 @@ def _caption(
     pictures: Sequence[int],
     lost: Sequence[tuple[float, float]],
 ) -> list[str]:
-    """What is drawn in the pictures and over time, in sentences; nothing that is not there."""
+    """Describe what is drawn in the pictures and over time, in sentences."""
     sentences = []
     if pictures:
         drawn = []

@@ -30,7 +30,7 @@ LETTER_INCHES = 0.07
 LINE_INCHES = 0.17
 """Height of a line of the legend."""
 PIXELS_PER_INCH = 96
-"""What a pixel of a figure's height is on paper, as CSS has it."""
+"""Pixels of a figure's height in an inch of paper, as CSS has it."""
 _MARKERS = {
     "circle": "o",
     "square": "s",
@@ -245,7 +245,7 @@ def _draw_bars(axes: Axes, trace: Any, x: Array, y: Array, width: float) -> None
 
 
 def _legend_label(trace: Any) -> str | None:
-    """What the legend calls a trace; None for one that is not in it."""
+    """Name of a trace in the legend; None for one that is not in it."""
     return _plain(trace.name) if trace.name and trace.showlegend is not False else None
 
 

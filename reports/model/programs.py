@@ -1,4 +1,4 @@
-"""Which programs made the runs of a tracker: which of them ranks, and which have equal results and share a row.
+"""Programs that made the runs of a tracker: which of them ranks, and which have equal results and share a row.
 
 A program is code, libraries and weights. The runs of one tracker with the same settings have a row
 for each program that made some of them. The row of the program that is installed here ranks.
@@ -318,7 +318,7 @@ def _merge_equal(programs: Iterable[Program]) -> list[ProgramRow]:
 
 
 def _program_text(row: RunRow) -> str:
-    """What a run's record says of its program; imports have none."""
+    """Text of a run's program, as its record states it; empty for imports."""
     if row.imported:
         return ""
     named = {name: row.identity[name] for name in ("scheme", *PROGRAM) if name in row.identity}

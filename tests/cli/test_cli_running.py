@@ -458,6 +458,21 @@ def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.Mon
     assert time.monotonic() - began < 300
 
 
+def test_why_kernels_were_not_compiled_ahead_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failing = [sys.executable, "-S", "-c", "raise OSError('no space left')"]
+    monkeypatch.setattr(
+        demo.subprocess,
+        "Popen",
+        lambda *_, popen=subprocess.Popen, **options: popen(failing, **options),
+    )
+    with compiled_ahead():
+        pass
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "OSError: no space left" in line
+
+
 def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):
     rows = {row["id"]: row for row in facts("trackers", "list")}
     assert {"never-move", "orb-slam2", "mask-rcnn", "emfoa-oft", "orbslam3"} <= set(rows)

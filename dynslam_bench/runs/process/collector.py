@@ -1,4 +1,4 @@
-"""What a run read, made of what a recorder has noted: contents of files, modules, distributions and programs."""
+"""The collection of what a run read from a recorder's notes: files, modules, distributions and programs."""
 
 import os
 import re
@@ -38,7 +38,7 @@ from dynslam_bench.core.reads import (
 from dynslam_bench.runs.process.origins import Origins
 
 _LOADED_NS = time.time_ns()
-"""What the fork server has loaded is older than this: it imports this module, too."""
+"""Time when this module was loaded: modules that the fork server has loaded are older."""
 _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
@@ -86,7 +86,7 @@ _OWN_DISTRIBUTION = "dynslam-bench"
 
 
 class Stamp(NamedTuple):
-    """What tells that a file is the same as before: its place on the disk, its size and its times.
+    """State of a file that tells whether it is the same as before: its place on the disk, its size and its times.
 
     Attributes:
         device: The device.
@@ -293,7 +293,7 @@ class Collector:
         return ABSENT if note.stamp is None and content != UNREADABLE else content
 
     def _still_missing(self) -> set[str]:
-        """What was looked for and is not there at the end either: the rest was made by the run."""
+        """Paths that were looked for and are still missing at the end: the run made the others."""
         return {
             path
             for path in set(self.notes.missing)

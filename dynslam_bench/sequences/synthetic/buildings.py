@@ -307,7 +307,7 @@ _BUILDERS: dict[str, Callable[[_Building], Walk]] = {
     "corridor": _corridor,
     "rooms": _rooms,
 }
-"""What furnishes each building."""
+"""Function that furnishes each building, by the building's name."""
 
 LOOPS = {
     f"loop_{name}{change}": Variant(

@@ -223,7 +223,7 @@ SYNCHRONOUS = {"synchronous": Variant(build_synchronous, "high-dynamic")}
 # What the sensors dislike: little light, little texture, little depth, depth as in sunlight.
 
 Change = Callable[[World, int], World]
-"""What a condition changes in a world, of a scene's number."""
+"""Change that a condition makes to the world of a scene, given by its number."""
 # sensors under a condition
 DARK = Optics(gain=0.13, color={"read_noise": 2.4, "shot_noise": 0.12, "shutter": 0.8})
 SUNLIGHT = Optics(

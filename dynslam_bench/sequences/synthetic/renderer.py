@@ -60,14 +60,14 @@ _LAMPS = np.array(
 _SHADOW_PLANE_M = 2.2
 """Height of the plane in which the things lie that cast the soft shadows."""
 _MEAN_GREY = 105.0
-"""What automatic exposure aims at."""
+"""Mean grey value (0-255) that automatic exposure aims at."""
 _MAINS_HZ = 100.0
 """Lamps flicker at twice the frequency of the mains."""
 _NOISE_VERSION = 5
 """Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
 
 HitImage = NDArray[np.int32]
-"""What every pixel sees, ``[H, W]``: 8 * primitive + face, -1 for nothing."""
+"""Surface that every pixel sees, ``[H, W]``: 8 * primitive + face, -1 for nothing."""
 ColorImage = NDArray[np.float32]
 """Colours ``[H, W, 3]`` from 0 to 255 before exposure and noise."""
 
