@@ -414,6 +414,19 @@ def show_runs(
     return rows
 
 
+def covariance_words(row: Mapping[str, Any]) -> str:
+    """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
+    parts = []
+    for span, over in (("1f", "one frame"), ("1s", "one second")):
+        ratio = row[f"nees_{span}_mean"]
+        if ratio is not None:
+            within = row[f"within95_{span}"]
+            parts.append(
+                f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
+            )
+    return ", ".join(parts)
+
+
 def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     """Show a single run in a few lines: its errors in millimetres, its trajectory, what is to be said of it."""
     record = store.read_whole(row["run_id"])
@@ -439,6 +452,7 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     facts = {
         "ATE": error,
         "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
+        "covariances": covariance_words(row),
         "frames": f"{record.n_tracked} of {record.n_frames} tracked",
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
