@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence
+from dynslam_bench.core.number_text import mm
+from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence, mean_of
 from dynslam_bench.reports.model.row import SEEN, RunRow
-from dynslam_bench.reports.tables.table import mm
 from dynslam_bench.runs.rows import part_words
 
 MEANINGS = {
@@ -23,6 +23,8 @@ MEANINGS = {
     "rendered": "rendered scenes",
 }
 """Categories in everyday words."""
+NEARLY_ALL = 0.95
+"""Share of the ground truth's time from which nothing is said of it: it often goes on behind the last image."""
 _BEST_NAMED = 2
 """Ranked trackers that an answer names, from the best on, beside the reference."""
 
@@ -135,10 +137,20 @@ def _words(board: Board, key: str, names: Sequence[str]) -> str:
         remarks.append("final trajectory")
     if error.sequences < error.asked:
         remarks.append(f"on {error.sequences}")
+    shares = [row.truth_share for name in names for row in _rows(board, key, name)]
+    share = mean_of(shares)
+    if share is not None and share < NEARLY_ALL:
+        remarks.append(f"{100 * share:.0f} % of the time")
     if error.lost:
         remarks.append(f"lost {error.lost}")
     behind = f" ({', '.join(remarks)})" if remarks else ""
     return f"{board.names[key]} {mm(error.median_m)} mm{behind}"
+
+
+def _rows(board: Board, key: str, name: str) -> list[RunRow]:
+    """The runs of a tracker on a sequence."""
+    cell = board.cells[key].get(name)
+    return [] if cell is None else list(cell.rows)
 
 
 def limits(board: Board) -> str:
