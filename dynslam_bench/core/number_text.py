@@ -2,6 +2,9 @@
 
 import math
 
+ROUNDING_M = 5e-7
+"""Lengths below this are shown as none: files of trajectories are rounded to about as much."""
+
 
 def significant_text(value: float, digits: int = 3) -> str:
     """A number with so many significant digits and no exponent where that can be read."""
@@ -15,6 +18,8 @@ def significant_text(value: float, digits: int = 3) -> str:
 
 def mm(metres: float) -> str:
     """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
+    if abs(metres) < ROUNDING_M:
+        return "0.000"
     return significant_text(1000.0 * metres)
 
 

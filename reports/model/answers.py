@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -25,6 +26,8 @@ MEANINGS = {
 """Categories in everyday words."""
 NEARLY_ALL = 0.95
 """Share of the ground truth's time from which nothing is said of it: it often goes on behind the last image."""
+_MOST_NAMED = 4
+"""Trackers that a sentence on failures names, those with the most first."""
 _BEST_NAMED = 2
 """Ranked trackers that an answer names, from the best on, beside the reference."""
 
@@ -163,10 +166,21 @@ def limits(board: Board) -> str:
         sentences.append("One run each: how far repeats lie apart is not known.")
     if any(row.seen_in_training for row in rows):
         sentences.append(f"{SEEN} Masks of a network that was trained on the very scene.")
-    failed = sum(row.failed for row in rows)
-    if failed:
-        sentences.append(f"{failed} of {len(rows)} runs failed, and count as not moving, or worse.")
-    return " ".join(sentences)
+    sentences.append(_failures_words(board))
+    return " ".join(filter(None, sentences))
+
+
+def _failures_words(board: Board) -> str:
+    """How many runs failed, and of which trackers; empty for none."""
+    failed = Counter(board.names[row.variant_key] for row in board.rows if row.failed)
+    if not failed:
+        return ""
+    named = [f"{name} {count}" for name, count in failed.most_common(_MOST_NAMED)]
+    if len(failed) > _MOST_NAMED:
+        named.append(f"{len(failed) - _MOST_NAMED} more trackers")
+    verb = "counts" if failed.total() == 1 else "count"
+    words = f"{failed.total()} of {len(board.rows)} runs failed ({', '.join(named)})"
+    return f"{words} and {verb} as not moving, or worse."
 
 
 def _kind_of_data(rows: Iterable[RunRow]) -> str:

@@ -252,7 +252,9 @@ def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
     assert code == 0
-    assert out.startswith("ATE (rmse) 0 mm over 4 poses, 100.0 % of the truth's time [tum-rgbd/v1")
+    assert out.startswith(
+        "ATE (rmse) 0.000 mm over 4 poses, 100.0 % of the truth's time [tum-rgbd/v1"
+    )
     found = facts("eval", truth, truth, "--protocol", "evo-default")
     assert found["protocol_id"] == "evo-default"
     assert found["metrics"]["ate_rmse_m"] < 1e-9
