@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from dynslam_bench.core import EvaluationError
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation.protocol import Alignment
 from dynslam_bench.geometry import Array, se3
 
@@ -53,7 +54,7 @@ class Similarity:
         positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
         along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
         return [
-            f"the path (spread {along:.3f} m along, {across[0]:.3f} and {across[1]:.3f} m across) hardly determines "
+            f"the path (spread {mm(along)} mm along, {mm(across[0])} and {mm(across[1])} mm across) hardly determines "
             f"the alignment's rotation with such errors: +-{self.uncertainty_deg:.0f} degrees; the absolute rotational "
             "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
         ]

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import Array, FileNotes, Trajectory, se3
@@ -278,7 +279,7 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
         Hint(
             "time-shift",
             f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each "
-            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, "
+            f"the error falls from {mm(error)} to {mm(undone)} mm (at its best scale); give the stamps of the images, "
             "on the truth's clock",
             {"shift_s": shift, "error_m": error, "error_undone_m": undone},
         )
@@ -321,8 +322,8 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     return [
         Hint(
             "scale",
-            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {error:.4g} "
-            f"to {undone:.4g} m; {cure}",
+            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {mm(error)} "
+            f"to {mm(undone)} mm; {cure}",
             {"scale": scale, "error_m": error, "error_undone_m": undone},
         )
     ]
@@ -354,7 +355,7 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     accuracy = COPY_M if noise > NOISE_M else EXACT_M
     least = min(accuracy, COPY_SHARE * fits[0].extent_m)
     if error < least:
-        text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
+        text = f"the error of {mm(error)} mm is below what trackers reach: were the poses read from the truth?"
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
 
     # the error jitters less than the truth does: the estimate has the same noise
@@ -365,8 +366,8 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     jitter = min(jitters)
     if jitter < 0.5 * noise and noise > NOISE_M:
         text = (
-            f"from frame to frame the error changes by {1000 * jitter:.3g} mm, less than the truth's own noise of "
-            f"{1000 * noise:.3g} mm: were the poses made from the truth?"
+            f"from frame to frame the error changes by {mm(jitter)} mm, less than the truth's own noise of "
+            f"{mm(noise)} mm: were the poses made from the truth?"
         )
         return [Hint("below-truth-noise", text, {"jitter_m": jitter, "truth_noise_m": noise})]
     return []

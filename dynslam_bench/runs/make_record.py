@@ -108,7 +108,7 @@ def make_record(
     last_message = end.final
 
     # a run with plug-ins gets its id now that it is known what they read
-    identity = resolved.stated
+    identity = resolved.identity
     if reads is not None:
         identity = identity | {"reads": reads.model_dump(mode="json")}
 
