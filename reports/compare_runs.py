@@ -349,6 +349,7 @@ def ratio_of(a: TrackerOnSequence, b: TrackerOnSequence) -> float | None:
 
 def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     """B beside A over the sequences, each recording once."""
+    # a recording that is there under several names counts once
     copies = copies_of({sequence: [*a.rows, *b.rows] for sequence, a, b in paired})
     log_ratios = {}
     lost: list[str] = []
@@ -358,6 +359,7 @@ def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     for sequence, cell_a, cell_b in paired:
         if sequence in copies:
             continue
+        # losses of either side, and the ratio where both have an error
         lost += [sequence] * cell_b.lost
         lost_by_a += [sequence] * cell_a.lost
         runs += min(len(cell_a.kept), len(cell_b.kept))

@@ -179,6 +179,7 @@ class Study(StudyPlan):
         callbacks: Iterable[Callable[[optuna.Study, FrozenTrial], object]] = (),
         **fields: Any,
     ) -> None:
+        # the spec, with the fields that are given in place of its own
         base = read_study(spec) if isinstance(spec, Path | str) else spec
         changes = {key: _texts(value) for key, value in fields.items()}
         # by name they are fields of the spec
@@ -195,6 +196,8 @@ class Study(StudyPlan):
             values = {"name": "study"} if base is None else base.model_dump()
             base = validated(StudySpec, values | changes, "the study", StudyError)
         super().__init__(base, results, objectives=objectives, constraints=constraints)
+
+        # pruner, callbacks, and what the study depends on
         self._has_own_pruner = pruner is not None
         self._pruner = pruner or build_pruner(base.pruner)
         self._callbacks = tuple(callbacks)
@@ -203,11 +206,15 @@ class Study(StudyPlan):
         self._identity = self._identify()
         if constraints:
             self._identity["constraints"] = sorted(constraints)
+
+        # the state of this worker's threads
         self._lock = threading.RLock()
         self._interrupted = threading.Event()
         self._is_exhausted = False
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
+
+        # the stored study, or a new one
         self.study = self._open(sampler or StreamedSampler(base), list(self._beginnings()))
         self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:

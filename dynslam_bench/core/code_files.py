@@ -161,6 +161,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
             continue
         for node in nodes:
+            # import statements, and calls whose first argument is a module's name
             if isinstance(node, ast.Import):
                 modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -171,6 +172,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
                 is_import = function.endswith(("import_module", "__import__"))
                 if is_import and isinstance(argument, ast.Constant):
                     modules.add(str(argument.value))
+    # the first part of each
     return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 

@@ -634,6 +634,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     """
     if board.reference is None or len(board.common) < FEWEST:
         return None
+    # log ratios of the errors on sequences that both have tracked
     logs = common_logs(board, [key, board.reference])
     lost = board.lost(key) | board.lost(board.reference)
     is_lost = np.array([name in lost for name in board.common], dtype=bool)
@@ -641,6 +642,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     differences = differences[~is_lost & np.isfinite(differences)]
     if len(differences) < FEWEST:
         return None
+    # the number of sequences that shows the measured gain at this scatter
     spread = float(differences.std(ddof=1))
     gain = 1.0 - math.exp(-abs(float(differences.mean())))
     n_tests = max(len(board.ranked) - 1, 1)
@@ -969,7 +971,7 @@ def timed(runs: Sequence[RunRow]) -> list[RunRow]:
 
 
 def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
-    """The runs whose times count: of those with frame times the ones on one computer.
+    """The runs whose times are compared: those with frame times that one computer has made.
 
     Args:
         runs: Some runs.

@@ -574,6 +574,7 @@ class ReadRecorder:
                     continue
                 if is_fork:  # it writes down itself what it reads
                     continue
+                # look again when the process has grown twice as old
                 key = (process.pid, born_s)
                 age_s = time.time() - born_s
                 if age_s >= max(least_age_s, 2 * self._age_at_look.get(key, 0.0)):

@@ -594,6 +594,7 @@ def _check_placeholders(
     document: ProgramDocument[Any], places: set[str], *, needs_all: bool
 ) -> None:
     """Refuse placeholders that stand for nothing, and settings that reach no program."""
+    # all texts in which placeholders may stand
     program = document.program
     texts = {"command": " ".join(program.command), "environment": " ".join(program.environment)}
     for target, text in document.templates.items():
@@ -611,6 +612,8 @@ def _check_placeholders(
                 f"{close}; {escape}" if close else escape,
             )
         used |= names
+
+    # a setting that no text names would have no effect
     unused = sorted(settings - used)
     if unused and needs_all:
         names_shown = ", ".join(unused)
