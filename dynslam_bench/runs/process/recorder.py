@@ -343,14 +343,17 @@ class ReadRecorder:
         """
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
+        # metadata of a distribution count by their version
         if path.endswith(_VERSIONS):
             self._read_version(frame, os.path.dirname(path))
             return
+        # a file that was noted before must not have changed since
         stamp = stamp_of(path)
         note = self._notes.files.get(path)
         if note is not None:
             self._collector.compare(path, note, stamp)
             return
+        # only files that count, read by code of others, and not made by the run
         is_special = stamp is not None and not os.path.isfile(path)  # a folder, a pipe, a socket
         if is_special or not self._counts_by_itself(path) or not self._is_foreign(frame):
             return
@@ -358,6 +361,8 @@ class ReadRecorder:
             return
         if self._collector.is_made_by_program(stamp):
             return
+
+        # the content now where it is small or may change, else at the end
         note = FileNote(stamp)
         if stamp is not None and whole:
             note.digest = content_now(path)
