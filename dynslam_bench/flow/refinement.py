@@ -582,7 +582,7 @@ def compare_with_template(
         space: Patch, template and its gradients.
         mean: Mean grey level of the template.
         at: Index of the window's first pixel in the patch.
-        weights: Of the part of a pixel by which the window is shifted.
+        weights: Bilinear weights of the part of a pixel by which the window is shifted.
     """
     # sums over the window, sixteen pixels at a time
     mean_t = spread(mean)

@@ -721,7 +721,7 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        # a well-tracked camera that sees something else at once was put elsewhere
+        # a well-tracked camera that sees something else at once was kidnapped
         points = int((last.point >= 0).sum())
         self._kidnapped = self.rotation is None and textured and points >= KIDNAP_POINTS
 

@@ -117,7 +117,7 @@ def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Arr
     Args:
         rng: Draws frequencies and phases.
         t: Seconds ``[N]``.
-        amplitude: Of the slowest sine, in the unit of the result.
+        amplitude: Amplitude of the slowest sine, in the unit of the result.
         axes: Number of axes.
     """
     total = np.zeros((len(t), axes))
