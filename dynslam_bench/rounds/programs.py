@@ -1,4 +1,4 @@
-"""What of an entry's tracker is frozen, and what of it has changed."""
+"""The program of an entry's tracker: what is frozen, and what of it has changed."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 """The part of an absolute path that differs from machine to machine: the round's folder."""
 _PLUGIN_FILES = "plugin:"
 _ENTRY_FILES = "work:/entries/"
-"""How names of files begin that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
+"""Beginnings of names of files that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
 _VERSION = "its version"
 
 

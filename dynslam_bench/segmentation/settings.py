@@ -295,7 +295,7 @@ class SegmentationSettings(Settings):
     """
 
     source: str = "auto"
-    """Where masks come from: ``auto`` (the embedded network on ``synthetic/*``, else ``coco`` or ``selfie``, whichever
+    """Source of masks: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
     was fetched, in this order), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
     (exact masks of the classes alone), ``embedded``, ``coco``, ``selfie`` (MediaPipe's small
     network of people indoors), ``onnx:PATH``, ``tflite:PATH`` (probability maps), ``recorded:DIR``,
