@@ -831,6 +831,15 @@ def test_one_that_never_ends_is_killed_with_what_it_started(toml, toy_folder, tm
         ({"output": "a/../../traj.txt"}, "is no file in the program's working folder"),
         ({"output": "~/traj.txt"}, "is no file in the program's working folder"),
         ({"output": ""}, "is no file in the program's working folder"),
+        (
+            {"templates": {"trajectory.txt": "old.txt"}},
+            "output: 'trajectory.txt' is made of the template 'old.txt' before the program starts",
+        ),
+        ({"templates": {".//trajectory.txt": "old.txt"}}, "is made of the template"),
+        (
+            {"output": "a/traj.txt", "templates": {"a/./traj.txt": "old.txt"}},
+            "is made of the template",
+        ),
         ({"exit_codes": []}, "exit_codes"),
         ({"exit_codes": [300]}, "exit_codes"),
         ({"exit_codes": ["ok"]}, "exit_codes"),
