@@ -563,7 +563,13 @@ def toml(tmp_path):
             "command": [sys.executable, "slam.py", *words],
         } | fields
         path = tmp_path / "slam.toml"
-        path.write_text("".join(f"{name} = {value!r}\n" for name, value in given.items()))
+        lines = []
+        for name, value in given.items():
+            if isinstance(value, dict):
+                lines += [f"{name}.{key!r} = {text!r}\n" for key, text in value.items()]
+            else:
+                lines.append(f"{name} = {value!r}\n")
+        path.write_text("".join(lines))
         return path
 
     return write
