@@ -39,7 +39,7 @@ LONGEST = (
     "tests/reports/",
     "tests/trackers/",
 )
-"""Files that take minutes: with `--no-loadscope-reorder` they begin first, so that no worker ends long after the others."""
+"""Files that take minutes. With `--no-loadscope-reorder` they begin first, so that all workers end together."""
 
 
 # What is imported and collected lives to the end: searching it for garbage takes a tenth of the time.
