@@ -791,10 +791,12 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
         )
     if all(case.baseline_m is None for case in result.cases):
         return f"all runs of the baseline were lost or failed on {on}, so nothing can be compared"
-    broken = "".join(f"guardrail broken: {guardrail.text}; " for guardrail in result.broken)
+    overruling = "".join(
+        f"guardrail {guardrail.state}: {guardrail.text}; " for guardrail in result.overruling
+    )
     more_lost = f"; lost runs {lost_baseline} -> {lost}" if lost != lost_baseline else ""
     if result.ratio is None:
-        return f"{broken}nothing could be compared on {on}{more_lost}"
+        return f"{overruling}nothing could be compared on {on}{more_lost}"
     percent = 100.0 * (result.ratio - 1.0)
     measured = f"{abs(percent):.1f} % {'more' if percent > 0 else 'less'} error on {on}"
     words = {
@@ -804,7 +806,7 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
         GateVerdict.NO_DIFFERENCE: f"{measured}; differences above {100 * result.margin:g} % are excluded",
         GateVerdict.UNDECIDED: f"{measured} so far, within the scatter",
     }
-    return broken + words[by_error] + more_lost
+    return overruling + words[by_error] + more_lost
 
 
 def _written(result: GateResult, place: Path) -> GateResult:
