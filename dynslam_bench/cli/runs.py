@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from dynslam_bench import runs as stored
+from dynslam_bench.cli.metric_tables import statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
     ProtocolId,
@@ -42,6 +43,7 @@ from dynslam_bench.core import (
     translate_errors,
     write_atomic,
 )
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
@@ -50,9 +52,9 @@ if TYPE_CHECKING:
 COLUMNS = {
     "run": "run_id",
     "tracker": "tracker",
+    "ATE (mm)": "ate_rmse_m",
     "sequence": "sequence",
     "status": "status",
-    "ATE (mm)": "ate_rmse_m",
     "ms/frame": "frame_ms",
     "frames": "frames",
     "repeat": "repeat",
@@ -65,7 +67,7 @@ COLUMNS = {
     "from the store": "from_store",
     "study": "study",
 }
-"""Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+"""Headings of the table, the most important first, and the names of what stands below them (see `make_run_row`)."""
 _IN_METRES = ("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m")
 """Errors of a row in metres, which are shown in millimetres."""
 MOST_REMARKS = 10
@@ -82,7 +84,7 @@ COLOURS = {
     "invalid": 31,
 }
 """Colours of the statuses on a terminal, as ANSI codes."""
-# Columns that `runs list` sorts by, and the names of those in a row that differ (see `run_row`).
+# Columns that `runs list` sorts by, and the names of those in a row that differ (see `make_run_row`).
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
@@ -188,7 +190,7 @@ def show(
             lines += [
                 "",
                 f"{which}: {evaluation.summary()}",
-                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                statistics_table(evaluation.metrics),
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
@@ -352,6 +354,8 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    from dynslam_bench.runs.record import coverage_text
+
     # empty and zero values stand for "nothing to say"
     identity = "unverified: its id does not tell the contents of data and code"
     return {
@@ -363,11 +367,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
         "sequence": record.sequence.id,
         "frames": stored.part_words(record),
-        "n_frames": record.n_frames,
-        "tracked": record.n_tracked,
+        "tracked": record.poses_words,
         "lost": record.n_lost,
         "initialising": record.n_initialising or None,
-        "coverage": record.coverage,
+        "coverage": coverage_text(record.coverage, record.truth_share),
         "repeat": record.repeat,
         "masks": record.segmentation,
         "device": record.device,
@@ -400,18 +403,31 @@ def show_runs(
         reused: Ids of the runs that are marked as taken from the store.
 
     Returns:
-        The table's rows, see `run_row`.
+        The table's rows, see `make_run_row`.
     """
     rows = []
     for record in records:
         # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
-        rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
+        rows.append(stored.make_run_row(record, metrics) | {"from_store": record.run_id in reused})
     if len(rows) == 1 and not json_mode():
         show_run(rows[0], store)
     else:
         show_rows(rows, store, protocol)
     return rows
+
+
+def covariance_words(row: Mapping[str, Any]) -> str:
+    """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
+    parts = []
+    for span, over in (("1f", "one frame"), ("1s", "one second")):
+        ratio = row[f"nees_{span}_mean"]
+        if ratio is not None:
+            within = row[f"within95_{span}"]
+            parts.append(
+                f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
+            )
+    return ", ".join(parts)
 
 
 def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
@@ -424,10 +440,10 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     # the error beside that of a camera that does not move
     error = ""
     if row["ate_rmse_m"] is not None:
-        error = f"{millimetres(row['ate_rmse_m'])} mm"
+        error = f"{mm(row['ate_rmse_m'])} mm"
     static_m = row["static_camera_ate_rmse_m"]
     if error and static_m and row["false_motion_max_m"] is None:
-        error += f", not moving {millimetres(static_m)} mm"
+        error += f", not moving {mm(static_m)} mm"
     false_motion = row["false_motion_max_m"]
 
     # the trajectories that the run left
@@ -438,8 +454,9 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
             trajectories[name] = str(path)
     facts = {
         "ATE": error,
-        "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
-        "frames": f"{record.n_tracked} of {record.n_frames} tracked",
+        "false motion": "" if false_motion is None else f"{mm(false_motion)} mm at most",
+        "covariances": covariance_words(row),
+        "tracked": record.poses_words,
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
         "masks": shown_cell("segmentation", row["segmentation"]),
@@ -483,7 +500,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    """Lines below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")
@@ -548,18 +565,12 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     return {run_id: run_id[:count] for run_id, count in digits.items()}
 
 
-def millimetres(metres: float) -> str:
-    """Metres as millimetres with three significant digits."""
-    value = f"{1000.0 * metres:#.3g}"
-    return f"{1000.0 * metres:.0f}" if "e+" in value else value.rstrip(".")
-
-
 def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: errors in millimetres, paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
     if name in _IN_METRES and isinstance(value, float):
-        return millimetres(value)
+        return mm(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 

@@ -51,7 +51,7 @@ from dynslam_bench.sequences.tags import FIXED_CAMERA
 from dynslam_bench.sequences.thumbnails import same_frames
 
 STATIC_CAMERA = "static camera (from ground truth)"
-"""What captions call the reference where it is a static camera."""
+"""Name in captions of the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
 """Tracker that errors are divided by where no other is asked for."""
 RankingBasis = Literal["common", "all"]
@@ -325,7 +325,7 @@ class Board:
 
             ``Float64`` columns:
 
-            - coverage and epipolar_skipped: shares, 0 to 1;
+            - coverage, truth_share (of imports whose frames are not known) and epipolar_skipped: shares, 0 to 1;
             - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
                 or worse;
             - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
@@ -566,7 +566,7 @@ def rank(
 
 
 def group_of(tags: Collection[str]) -> str:
-    """What moves in a scene, by the tags of its sequence."""
+    """Group of a scene: what moves in it, by the tags of its sequence."""
     return next((group for tag, group in _GROUPS.items() if tag in tags), _OTHER)
 
 
@@ -741,7 +741,7 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: the true poses are the same, or the pictures before a fixed camera.
+    """Find sequences that are copies of others: equal true poses, or equal pictures before a fixed camera.
 
     Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
@@ -801,7 +801,7 @@ def _is_same_path(row: RunRow, other: RunRow) -> bool:
 
 
 def copies_note(board: Board) -> str:
-    """Which sequences are one recording and count once, and why; empty where none are."""
+    """Note on sequences that are one recording and count once, and why; empty where none are."""
     names = grouped(board.copies, board.copies.__getitem__)
     shown = [
         f"{first} counts once for {', '.join([first, *others])}" for first, others in names.items()
@@ -981,6 +981,11 @@ def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
     return max(by_computer.values(), key=lambda rows: (len(rows), rows[0].computer), default=[])
 
 
+def mean_coverage(rows: Sequence[RunRow]) -> tuple[float | None, float | None]:
+    """Mean coverage of runs, and the mean share of the truth's time of those whose frames are not known."""
+    return mean_of(row.coverage for row in rows), mean_of(row.truth_share for row in rows)
+
+
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Mean of what is known; None if nothing is."""
     present = [value for value in values if value is not None]
@@ -1098,6 +1103,7 @@ _COLUMNS = {
     ),
     "Float64": (
         "coverage",
+        "truth_share",
         "score_m",
         "hold_last_pose_ate_m",
         "final_ate_m",

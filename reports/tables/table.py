@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -116,7 +115,7 @@ class Table:
     brief: str = ""
 
     def frame(self) -> pd.DataFrame:
-        """What CSV holds, in columns named by `Column.key`.
+        """The table as CSV holds it, in columns named by `Column.key`.
 
         Numbers have all their digits, in the units that the caption and the headings name (errors
         in metres, times in milliseconds, shares from 0 to 1); other cells have their words.
@@ -229,21 +228,6 @@ def _no_formula(value: object) -> object:
     if isinstance(value, str):
         return "'" * value.startswith(("=", "+", "-", "@", "\t", "\r")) + printable(value)
     return value
-
-
-def mm(metres: float) -> str:
-    """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
-    return significant_text(1000.0 * metres)
-
-
-def significant_text(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits and no exponent where that can be read."""
-    if not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    text = f"{value:#.{digits}g}"
-    return f"{value:.0f}" if "e+" in text else text.rstrip(".")
 
 
 def percent(share: float) -> str:
@@ -386,7 +370,7 @@ def _float(table: Table, tabulars: Sequence[str], number: int, protocol: str) ->
 
 
 def _blocks(table: Table) -> list[list[int]]:
-    """Which columns stand side by side; the names of the rows stand in every block."""
+    """Columns of each block that stand side by side; the names of the rows stand in every block."""
     # the first column of texts holds the names of the rows
     shown = [at for at, column in enumerate(table.columns) if column.latex]
     names = next((at for at in shown if not table.columns[at].numeric), 0)
@@ -432,7 +416,7 @@ def _heading(name: str) -> list[str]:
 
 
 def _plain(cell: TableCell) -> str:
-    """What LaTeX shows of a cell, unescaped."""
+    """Text of a cell in LaTeX, unescaped."""
     if cell.emphasis == "failed":
         return "failed"
     text = cell.text.replace(OUR_BACK_END, "*")
