@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
@@ -23,11 +24,11 @@ from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.html.board_page import cell_data, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import TrackerOnSequence, copies_of, make_cell, mean_of
+from dynslam_bench.reports.model.board import TrackerOnSequence, copies_of, make_cell, mean_coverage
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
-from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
+from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
 
@@ -435,8 +436,8 @@ def _error_cell(cell: TrackerOnSequence) -> TableCell:
 
 def _coverage_cell(cell: TrackerOnSequence) -> TableCell:
     """The mean coverage of runs."""
-    coverage = mean_of(row.coverage for row in cell.rows)
-    return TableCell(coverage_text(coverage), value=coverage)
+    coverage, truth_share = mean_coverage(cell.rows)
+    return TableCell(coverage_text(coverage, truth_share), value=coverage)
 
 
 def _all_sequences(ratio: PairedRatio) -> str:

@@ -11,6 +11,7 @@ import plotly.graph_objects as go
 from optuna.trial import TrialState
 
 from dynslam_bench.core import read_text, setting_text, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.evaluation.verdicts import ComparisonVerdict, PairedRatio
 from dynslam_bench.reports.build_report import sections_page
@@ -24,7 +25,6 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     csv_text,
-    mm,
     number,
     numbers,
 )

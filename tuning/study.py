@@ -781,11 +781,11 @@ class Study(StudyPlan):
             time.sleep(0.05)
 
     def _is_half_begun(self, study: optuna.Study) -> bool:
-        """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
+        """Whether a process of this toolkit began the stored study and was killed before it had an identity."""
         facts = study.user_attrs
         if "identity" in facts:
             return False
-        # as a storage holds it: tuples are lists there
+        # another program's study has trials or attributes of its own; tuples are lists in a storage
         spec = json.loads(json.dumps(self.spec.for_others()))
         is_empty = not facts and not study.get_trials(deepcopy=False)
         return facts.get("spec") == spec or is_empty

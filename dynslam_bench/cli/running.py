@@ -477,8 +477,11 @@ class WatchedRuns:
     def __init__(
         self, store: runs.RunStore, jobs: int, protocol: str, folders: Iterable[str] = ()
     ) -> None:
+        from dynslam_bench.runs.spec import place_of
+
         self.store = store
-        self._to_announce = set(folders)
+        # as the runs name them
+        self._to_announce = set(map(place_of, folders)) - {""}
         self.jobs = jobs
         self.protocol = protocol
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from dynslam_bench import runs as stored
+from dynslam_bench.cli.metric_tables import statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
     ProtocolId,
@@ -42,6 +43,7 @@ from dynslam_bench.core import (
     translate_errors,
     write_atomic,
 )
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
@@ -50,9 +52,9 @@ if TYPE_CHECKING:
 COLUMNS = {
     "run": "run_id",
     "tracker": "tracker",
+    "ATE (mm)": "ate_rmse_m",
     "sequence": "sequence",
     "status": "status",
-    "ATE (mm)": "ate_rmse_m",
     "ms/frame": "frame_ms",
     "frames": "frames",
     "repeat": "repeat",
@@ -188,7 +190,7 @@ def show(
             lines += [
                 "",
                 f"{which}: {evaluation.summary()}",
-                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                statistics_table(evaluation.metrics),
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
@@ -352,6 +354,8 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    from dynslam_bench.runs.record import coverage_text
+
     # empty and zero values stand for "nothing to say"
     identity = "unverified: its id does not tell the contents of data and code"
     return {
@@ -363,11 +367,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
         "sequence": record.sequence.id,
         "frames": stored.part_words(record),
-        "n_frames": record.n_frames,
-        "tracked": record.n_tracked,
+        "tracked": record.poses_words,
         "lost": record.n_lost,
         "initialising": record.n_initialising or None,
-        "coverage": record.coverage,
+        "coverage": coverage_text(record.coverage, record.truth_share),
         "repeat": record.repeat,
         "masks": record.segmentation,
         "device": record.device,
@@ -437,10 +440,10 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     # the error beside that of a camera that does not move
     error = ""
     if row["ate_rmse_m"] is not None:
-        error = f"{millimetres(row['ate_rmse_m'])} mm"
+        error = f"{mm(row['ate_rmse_m'])} mm"
     static_m = row["static_camera_ate_rmse_m"]
     if error and static_m and row["false_motion_max_m"] is None:
-        error += f", not moving {millimetres(static_m)} mm"
+        error += f", not moving {mm(static_m)} mm"
     false_motion = row["false_motion_max_m"]
 
     # the trajectories that the run left
@@ -451,9 +454,9 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
             trajectories[name] = str(path)
     facts = {
         "ATE": error,
-        "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
+        "false motion": "" if false_motion is None else f"{mm(false_motion)} mm at most",
         "covariances": covariance_words(row),
-        "frames": f"{record.n_tracked} of {record.n_frames} tracked",
+        "tracked": record.poses_words,
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
         "masks": shown_cell("segmentation", row["segmentation"]),
@@ -562,18 +565,12 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     return {run_id: run_id[:count] for run_id, count in digits.items()}
 
 
-def millimetres(metres: float) -> str:
-    """Metres as millimetres with three significant digits."""
-    value = f"{1000.0 * metres:#.3g}"
-    return f"{1000.0 * metres:.0f}" if "e+" in value else value.rstrip(".")
-
-
 def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: errors in millimetres, paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
     if name in _IN_METRES and isinstance(value, float):
-        return millimetres(value)
+        return mm(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 

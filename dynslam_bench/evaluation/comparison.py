@@ -386,6 +386,12 @@ def apply_policy(
 ) -> tuple[Trajectory, NDArray[np.bool_] | None]:
     """The estimate with its lost frames held or left out, as the protocol has it.
 
+    Args:
+        estimate: Camera-to-world poses as the tracker gave them.
+        protocol: Its `lost_frames` policy is applied.
+        input_timestamps: Stamps of all input frames, seconds; None if they are not known.
+        diagnostics: Gains a line on what was held or left out.
+
     Returns:
         The estimate, and which input frames were tracked ``[N]``; None where the input frames are
         not known.
@@ -416,6 +422,35 @@ def apply_policy(
 
 STAMP_TOLERANCE = 1e-3
 """Seconds within which two stamps name the same input frame (trajectory files round to a microsecond or worse)."""
+
+
+LONGEST_STEP_S = 1.0
+"""Poses that are farther apart in time have a hole between them, unless the trajectory has keyframes alone."""
+LONGEST_STEP = 5.0
+"""The same in median steps of a trajectory, for one of keyframes."""
+
+
+def share_of_time(stamps: ArrayLike, true_stamps: ArrayLike) -> float:
+    """Share of the ground truth's time that a trajectory has poses for, 0 to 1; holes do not count.
+
+    It takes the place of the coverage where the input frames are not known. A ground truth that is
+    longer than the recording makes it smaller than the coverage.
+
+    Args:
+        stamps: Stamps of the poses in seconds, in order.
+        true_stamps: Stamps of the ground truth in seconds, in order.
+    """
+    poses = np.asarray(stamps, dtype=np.float64)
+    truth = np.asarray(true_stamps, dtype=np.float64)
+    whole_s = float(truth[-1] - truth[0])
+    if len(poses) < 2 or whole_s <= 0:
+        return 0.0
+
+    # steps between poses, as far as they lie within the truth's time
+    longest_s = max(LONGEST_STEP_S, LONGEST_STEP * float(np.median(np.diff(poses))))
+    is_step = np.diff(poses) <= longest_s
+    within_s = np.diff(np.clip(poses, truth[0], truth[-1]))
+    return min(1.0, float(within_s[is_step].sum()) / whole_s)
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:

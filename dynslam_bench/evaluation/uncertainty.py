@@ -250,7 +250,7 @@ def _matrices_of(estimate: Trajectory, covariances: MotionCovariances) -> Array:
 
 
 def _validate(matrices: Array, given: int) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which covariances ``[M, 6, 6]`` can be used, ``[M]``, and a line for each kind of fault.
+    """Flags ``[M]`` of the covariances ``[M, 6, 6]`` that can be used, and a line for each kind of fault.
 
     Args:
         matrices: The covariances.

@@ -147,7 +147,7 @@ def _board_row(opened: RoundFolder, entry: str, rows: list[ScoredRow]) -> BoardR
 
 
 def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
-    """What holds for all rows."""
+    """Remarks that hold for all rows."""
     of = opened.round
     late = opened.late_entries()
     remarks = [

@@ -72,7 +72,7 @@ def enter(
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
     program = program_of(record.identity)
-    _check_new(opened, tracker, program)
+    check_is_new(opened, tracker, program)
     entry = Entry(
         name=name,
         round_sha256=opened.sha256,
@@ -116,7 +116,7 @@ def _check_open(opened: RoundFolder, name: str, now: datetime) -> None:
         )
 
 
-def _check_new(opened: RoundFolder, tracker: str, program: Program) -> None:
+def check_is_new(opened: RoundFolder, tracker: str, program: Program) -> None:
     """Check that no entry has the same program: the two would share their runs.
 
     Raises:

@@ -24,9 +24,9 @@ from dynslam_bench.sequences.synthetic.sealed import ROUND_NAME, parse_salt, sea
 from dynslam_bench.sequences.synthetic.settings import MAX_FRAMES, RENDERER_VERSION
 
 ROUND_FILE = "round.json"
-"""What the organiser publishes first."""
+"""File that the organiser publishes first."""
 REVEAL_FILE = "reveal.json"
-"""What the organiser publishes after the deadline."""
+"""File that the organiser publishes after the deadline."""
 RESULTS_FILE = "results.json"
 """Says which rows a runner's bank holds."""
 ROUND_SCHEMA = 1
@@ -205,7 +205,7 @@ class Entry(RoundRecord):
 
 
 class Reveal(RoundRecord):
-    """What ends a round: the salt, and the entries that were received in time.
+    """The end of a round: the salt, and the entries that were received in time.
 
     Attributes:
         round_sha256: SHA-256 of ``round.json``.
@@ -229,7 +229,7 @@ class Row(Record):
 
 
 class Results(RoundRecord):
-    """What a runner has run: describes the bank beside it.
+    """Results of a runner: describes the bank beside it.
 
     Attributes:
         by: Name of the runner.

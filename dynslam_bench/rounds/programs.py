@@ -1,4 +1,4 @@
-"""What of an entry's tracker is frozen, and what of it has changed."""
+"""The program of an entry's tracker: what is frozen, and what of it has changed."""
 
 import contextlib
 import json

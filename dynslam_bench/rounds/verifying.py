@@ -44,7 +44,7 @@ class RerunRow:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was checked of a round.
+    """Outcome of the checks of a round.
 
     Attributes:
         faults: What is wrong, a line each.
@@ -165,7 +165,7 @@ def _compared(opened: RoundFolder, row: ScoredRow, again: ScoredRow) -> RerunRow
 
 
 def faults_of(opened: RoundFolder, by: str, *, render: bool) -> list[str]:
-    """What is wrong with a runner's results, a line each; nothing is run.
+    """Faults of a runner's results, a line each; nothing is run.
 
     Args:
         opened: The round.
@@ -198,7 +198,7 @@ def faults_of(opened: RoundFolder, by: str, *, render: bool) -> list[str]:
 
 
 def _fault_of_row(opened: RoundFolder, by: str, row: Row, sequences: set[str]) -> str:
-    """What is wrong with a row: its entry, its scene, its program or its ground truth; empty for nothing."""
+    """Fault of a row: of its entry, scene, program or ground truth; empty for none."""
     if row.entry not in opened.reveal.entries:
         return f"{REVEAL_FILE} does not list this entry"
     if row.sequence not in sequences:

@@ -108,7 +108,7 @@ def make_record(
     last_message = end.final
 
     # a run with plug-ins gets its id now that it is known what they read
-    identity = resolved.stated
+    identity = resolved.identity
     if reads is not None:
         identity = identity | {"reads": reads.model_dump(mode="json")}
 
@@ -305,7 +305,7 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
 
 
 def sequence_part_digest(identity: dict[str, Any]) -> str:
-    """Names what of the sequence a run saw: content and frames."""
+    """Digest of the part of a sequence that a run saw: content and frames."""
     return digest(
         {key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16
     )

@@ -211,7 +211,14 @@ def smooth(
 def _smooth_segment(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
-    """`smooth` within a part without gaps."""
+    """`smooth` within a part without gaps.
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        poses: Measured world-to-camera poses ``[N, 4, 4]``.
+        covariances: Their covariances ``[N, 6, 6]``.
+        settings: Standard deviations of the accelerations.
+    """
     # forwards: filter, and keep each prediction
     state = MotionState.at(poses[0], covariances[0])
     filtered = [state]

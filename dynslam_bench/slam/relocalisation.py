@@ -324,7 +324,16 @@ def _ransac_place(
     rng: np.random.Generator,
     min_inliers: int,
 ) -> InitialPose | None:
-    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
+    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it.
+
+    Args:
+        slam_map: The map.
+        keyframe: Slot of the keyframe.
+        observations: The frame's features.
+        matches: Its matches with the keyframe's map points.
+        rng: Draws the samples.
+        min_inliers: Inliers that are needed.
+    """
     feature = matches.feature
     # reprojection errors by the features' own information
     ransac = ransac_pose(

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
 from dynslam_bench.core.module_graph import PLUMBING, module_graph
+from dynslam_bench.core.number_text import mm, significant_text
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.evaluation.verdicts import CATASTROPHE, FLOOR_M
@@ -28,7 +29,6 @@ from dynslam_bench.reports.html.page import read_remark, write_changed, write_si
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
 from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
-from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE, read_snapshots
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
@@ -341,6 +341,8 @@ def run_summary(
         return "amber", f"{words}. {loss}" if loss else words
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
+    if row.coverage is None:
+        return "amber" if far_off else "green", f"{row.poses_words}: {error}{far_off}"
     tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
     return "amber" if far_off else "green", f"{tracked}: {error}{far_off}"
 
@@ -419,7 +421,7 @@ def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
         (ate_name, ate),
         ("of a static camera's", of_static),
         (rpe_name, rpe_text),
-        ("coverage", coverage_text(row.coverage)),
+        ("coverage", coverage_text(row.coverage, row.truth_share)),
         ("time of a frame", time),
         ("memory", memory),
     ]
@@ -434,7 +436,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
     words = [
         f"{row.label} on {row.sequence.id}{part}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm",
         "lost frames held at the last pose",
-        f"coverage {coverage_text(row.coverage)}",
+        f"coverage {coverage_text(row.coverage, row.truth_share)}",
         protocol.describe(),
     ]
     if row.git:

@@ -325,7 +325,7 @@ class Board:
 
             ``Float64`` columns:
 
-            - coverage and epipolar_skipped: shares, 0 to 1;
+            - coverage, truth_share (of imports whose frames are not known) and epipolar_skipped: shares, 0 to 1;
             - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
                 or worse;
             - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
@@ -981,6 +981,11 @@ def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
     return max(by_computer.values(), key=lambda rows: (len(rows), rows[0].computer), default=[])
 
 
+def mean_coverage(rows: Sequence[RunRow]) -> tuple[float | None, float | None]:
+    """Mean coverage of runs, and the mean share of the truth's time of those whose frames are not known."""
+    return mean_of(row.coverage for row in rows), mean_of(row.truth_share for row in rows)
+
+
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Mean of what is known; None if nothing is."""
     present = [value for value in values if value is not None]
@@ -1098,6 +1103,7 @@ _COLUMNS = {
     ),
     "Float64": (
         "coverage",
+        "truth_share",
         "score_m",
         "hold_last_pose_ate_m",
         "final_ate_m",

@@ -139,12 +139,17 @@ class ProgramRow:
         return equal >= FEWEST_EQUAL
 
     def shared_results(self) -> int:
-        """Results of runs that ended well which several of its programs have; other seeds' copies do not count."""
-        # which programs made each run
+        """Number of different good results of runs that several of the row's programs have made.
+
+        A deterministic tracker gives one result for all seeds: it counts once.
+        """
+        # the programs that made each run
         makers: dict[Repeat, set[int]] = {}
         for at, program in enumerate(self.programs):
             for row in program.rows:
                 makers.setdefault((row.sequence_key, row.repeat_key), set()).add(at)
+
+        # different results, whatever the seed
         shared = set()
         for repeat, programs in makers.items():
             column, (offset, noise, _, _) = repeat

@@ -18,7 +18,7 @@ from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.layout import TrajectoryKind
-from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
+from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord, coverage_text
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.tags import FIXED_CAMERA
@@ -229,6 +229,8 @@ class RunRow(RunRecord):
         """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
         if not self.failed:
             return ""
+        if self.status == "lost" and self.coverage is None:
+            return f"lost, {coverage_text(None, self.truth_share)}"
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
         if self.status == "ok":

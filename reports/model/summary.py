@@ -49,7 +49,8 @@ def headline(board: Board) -> str:
         return f"{where}{board.reference_name} lost all, so no tracker can be compared with it."
     if not claimed:
         n_worse = sum(standing.verdict == "worse" for standing in ranked)
-        return f"{where}no tracker is shown to be better than {board.reference_name}; {_are(n_worse)} worse."
+        worse = f"; {_are(n_worse)} worse" if n_worse else ""
+        return f"{where}no tracker is shown to be better than {board.reference_name}{worse}."
     return f"{where}{claimed}."
 
 

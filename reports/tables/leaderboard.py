@@ -11,6 +11,7 @@ from statistics import median
 import numpy as np
 
 from dynslam_bench.core import label_text
+from dynslam_bench.core.number_text import mm, significant_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE, FLOOR_M
@@ -22,6 +23,7 @@ from dynslam_bench.reports.model.board import (
     TrackerOnSequence,
     TrackerPair,
     compare_pairs,
+    mean_coverage,
     mean_of,
     rank,
     timed,
@@ -36,11 +38,9 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     emphasise,
-    mm,
     number,
     numbers,
     percent,
-    significant_text,
     texts,
 )
 from dynslam_bench.runs.record import coverage_text
@@ -282,7 +282,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
     runs = board.runs(key)
     ended = [row for row in runs if not row.failed]
     tracker = runs[0].tracker
-    coverage = mean_of(row.coverage for row in runs)
+    coverage, truth_share = mean_coverage(runs)
 
     # the name, marked where a trajectory is probably faulty
     hinted = _hint_counts(runs)
@@ -299,7 +299,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(label, hinted, tip=tracker.id),
-        "coverage": TableCell(coverage_text(coverage), value=coverage),
+        "coverage": TableCell(coverage_text(coverage, truth_share), value=coverage),
         "× real time": speed_cell(board, ended),
         "MB": number(median_of(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(small=runs[0].program_remark, tag=origin_words),
@@ -998,7 +998,7 @@ def _ate_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual_runs:
     cell = board.cells[key].get(sequence)
     if cell is None:
         return TableCell("–", emphasis="muted", tip="not run")
-    coverage = f"coverage {coverage_text(mean_of(row.coverage for row in cell.rows))}"
+    coverage = f"coverage {coverage_text(*mean_coverage(cell.rows))}"
     link = run_link(cell.typical)
     count = "" if len(cell.rows) == usual_runs else f"n={len(cell.rows)}"
 
@@ -1135,7 +1135,7 @@ def failures(board: Board) -> Table | None:
             TableCell(board.sequence(row)),
             TableCell(row.repeat),
             TableCell(row.ending),
-            TableCell(coverage_text(row.coverage), value=row.coverage),
+            TableCell(coverage_text(row.coverage, row.truth_share), value=row.coverage),
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]

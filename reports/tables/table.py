@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -229,21 +228,6 @@ def _no_formula(value: object) -> object:
     if isinstance(value, str):
         return "'" * value.startswith(("=", "+", "-", "@", "\t", "\r")) + printable(value)
     return value
-
-
-def mm(metres: float) -> str:
-    """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
-    return significant_text(1000.0 * metres)
-
-
-def significant_text(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits and no exponent where that can be read."""
-    if not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    text = f"{value:#.{digits}g}"
-    return f"{value:.0f}" if "e+" in text else text.rstrip(".")
 
 
 def percent(share: float) -> str:

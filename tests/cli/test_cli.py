@@ -252,7 +252,9 @@ def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
     assert code == 0
-    assert out.startswith("ATE (rmse) 0.0000 m over 4 poses [tum-rgbd/v1")
+    assert out.startswith(
+        "ATE (rmse) 0.000 mm over 4 poses, 100.0 % of the truth's time [tum-rgbd/v1"
+    )
     found = facts("eval", truth, truth, "--protocol", "evo-default")
     assert found["protocol_id"] == "evo-default"
     assert found["metrics"]["ate_rmse_m"] < 1e-9
@@ -492,7 +494,7 @@ def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
     )
     code, out, _ = cli(*command, "--published", "77")
     assert code == 0
-    assert "No row agrees with 77; the nearest is" in out.splitlines()[-1]
+    assert "No row agrees with 77 m; the nearest is" in out.splitlines()[-1]
     code, _, err = cli(*command, "--published", "7cm")
     assert code == 1
     assert "as it was printed" in one_line(err)

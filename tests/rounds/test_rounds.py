@@ -16,6 +16,7 @@ from dynslam_bench.core import DynslamError, RunError, file_sha256
 from dynslam_bench.core.fingerprint import this_machine
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
+from dynslam_bench.rounds.entering import check_is_new
 from dynslam_bench.rounds.files import (
     Program,
     RoundFolder,
@@ -190,6 +191,15 @@ def test_an_entry_counts_as_it_was_when_the_round_was_revealed(tmp_path: Path) -
         opened.received_entry("still")
 
 
+def test_one_tracker_with_the_same_settings_enters_once(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    entered(opened, "still")
+    program = opened.read_entry("still").program
+    with pytest.raises(RunError, match="entry 'still' is the same tracker"):
+        check_is_new(opened, "never-move", program)
+    check_is_new(opened, "never-move", program.model_copy(update={"settings": {"n": 1}}))
+
+
 def test_an_entry_of_another_protocol_or_round_is_refused_by_name(tmp_path: Path) -> None:
     opened = written(tmp_path / "r")
     entered(opened, "other", protocol="evo-default")
@@ -269,14 +279,11 @@ def test_programs_differ_by_settings_code_weights_and_files() -> None:
 
 def first_machine(root: Path) -> None:
     """The organiser and three entrants: commitment, entries, reveal, and all runs."""
-    rounds.new_round(root, name="test", families=["walking_xyz"], scenes=2, frames=6)
+    rounds.new_round(root, name="test", families=["walking_xyz"], scenes=2, frames=4)
     write_tracker_template("mine", root / "entries" / "mine")
     rounds.enter(root, "never-move", name="still")
     rounds.enter(root, "orb-slam2", name="orb", settings={"features.n_features": 700})
-    mine = "entries/mine/mine.py:SPEC"
-    rounds.enter(root, mine, name="mine")
-    with pytest.raises(RunError, match="'mine' is the same tracker"):
-        rounds.enter(root, mine, name="again")
+    rounds.enter(root, "entries/mine/mine.py:SPEC", name="mine")
 
     # this machine with other bits
     of = open_round(root).round
@@ -296,11 +303,13 @@ def second_machine(root: Path) -> None:
     found = rounds.verify(root, by="bob", sample=2)
     assert found.faults == []
     assert [again.agreement for again in found.rerun] == ["identical"] * 6
+    shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     board = rounds.report(root)
+    assert "Late, not run: late." in board.remarks
     assert {row.entry for row in board.rows} == {"still", "orb", "mine"}
     assert all(row.reproduced == {"bob": (2, 2, 2)} for row in board.rows)
     assert board.faults == []
-    assert "alice" in board.markdown.read_text()
+    assert "run by" in board.markdown.read_text()
     assert board.html.is_file()
 
     changed_trajectory(root)
@@ -341,9 +350,7 @@ def changed_trajectory(root: Path) -> None:
     file.write_text(before.replace(" 0 0 0 0", " 0 0.001 0 0", 1) + "# changed\n")
     found = rounds.verify(root, by="bob", sample=0)
     assert any("trajectory_online.txt" in fault and run.name in fault for fault in found.faults)
-    assert rounds.report(root).faults
     file.write_text(before)
-    assert rounds.verify(root, by="bob", sample=0).ok
 
 
 def better_trajectory(root: Path) -> None:
@@ -390,7 +397,6 @@ def changed_tracker(root: Path) -> None:
 
 
 def late_entry(root: Path) -> None:
-    shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     with pytest.raises(RunError, match=r"entry 'late' is not listed in reveal\.json"):
         rounds.run(root, by="carol", entries=["late"])
     # rows of an entry that is not listed
@@ -398,7 +404,6 @@ def late_entry(root: Path) -> None:
     results.write_text(results.read_text().replace('"entry": "still"', '"entry": "late"'))
     found = rounds.verify(root, by="bob", sample=0)
     assert sum("late on" in fault and "does not list" in fault for fault in found.faults) == 2
-    assert "late" in " ".join(rounds.report(root).remarks)
 
 
 def played(machine: str, folder: Path) -> None:

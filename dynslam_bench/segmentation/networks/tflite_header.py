@@ -43,7 +43,7 @@ LONGEST_LABELS = 100_000
 
 @dataclass(frozen=True)
 class TfliteHeader:
-    """What a TensorFlow Lite file declares.
+    """Inputs, outputs and labels that a TensorFlow Lite file declares.
 
     Attributes:
         inputs: Its inputs, images as ``[1, H, W, C]``.
@@ -59,7 +59,7 @@ class TfliteHeader:
 
 
 def read_tflite_header(path: Path) -> TfliteHeader:
-    """What a TensorFlow Lite file declares.
+    """Read the inputs, outputs and labels that a TensorFlow Lite file declares.
 
     Raises:
         SegmentationError: The file is missing, truncated or no TensorFlow Lite model.
