@@ -25,6 +25,10 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
+from dynslam_bench.geometry.motion_covariances import (
+    MotionCovariances,
+    write_motion_covariances,
+)
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.testing import (
@@ -124,6 +128,21 @@ def test_replay_skips_a_hole(trajectory, tmp_path):
     tracker = reset(build_tracker(f"replay:{holed}"))
     states = [tracker.track(blank(i, stamp)).state for i, stamp in enumerate(stamps)]
     assert states == ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 12
+
+
+def test_replay_gives_the_covariances_of_a_file(trajectory, tmp_path):
+    path, stamps, _ = trajectory
+    file = tmp_path / "covariances.txt"
+    matrices = np.array([np.eye(6) * (k + 1) for k in range(19)])
+    write_motion_covariances(file, MotionCovariances(stamps[1:], matrices))
+    settings = {"covariances": str(file)}
+    tracker = reset(build_tracker(f"replay:{path}", settings))
+    results = [tracker.track(blank(k, float(stamp))) for k, stamp in enumerate(stamps)]
+    assert results[0].motion_covariance is None
+    assert [result.motion_covariance[0, 0] for result in results[1:]] == list(range(1, 20))
+    file.write_text("1 2\n")
+    with pytest.raises(TrajectoryError, match="has 2 values, not the 37"):
+        build_tracker(f"replay:{path}", settings)
 
 
 def test_replay_id_carries_the_file(trajectory):
