@@ -43,6 +43,7 @@ from dynslam_bench.trackers.adapters import odometry as opencv_odometry
 from dynslam_bench.trackers.adapters.odometry import FrameToFrame
 from dynslam_bench.trackers.adapters.orbslam3 import check_camera, find_vocabulary, settings_yaml
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
+from dynslam_bench.trackers.adapters.subprocess_tracker import read_track_answer
 from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose
 
@@ -627,3 +628,25 @@ def test_frames_without_features():
         )
         assert tracker.track(seen).state == "ok"
         assert tracker.finalize().timestamps.tolist() == [4 / 30]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (np.eye(6).ravel().tolist(), np.eye(6)),
+        (np.eye(6).tolist(), np.eye(6)),
+        ([1.0, 2.0], np.full((6, 6), np.nan)),
+        ("sure", np.full((6, 6), np.nan)),
+        ({"a": 1}, np.full((6, 6), np.nan)),
+        ([1e12] * 36, np.full((6, 6), 1e12)),
+        (None, None),
+    ],
+)
+def test_a_program_may_answer_with_a_covariance(given, expected):
+    answer = {"index": 0, "state": "ok", "T_world_cam": np.eye(4).ravel().tolist()}
+    answer["motion_covariance"] = given
+    result = read_track_answer(answer, blank(0, 0.0), "program", lambda: 0.0)
+    if expected is None:
+        assert result.motion_covariance is None
+    else:
+        assert np.array_equal(result.motion_covariance, expected, equal_nan=True)
