@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
 
 app = typer.Typer(
-    help="Sealed rounds: trackers are frozen first, scenes that nobody could know are rendered afterwards.",
+    help="Sealed rounds: trackers are frozen first, their scenes are rendered afterwards.",
     no_args_is_help=True,
 )
 Folder = Annotated[Path, typer.Argument(metavar="ROUND", help="The round's folder.")]

@@ -303,7 +303,7 @@ def bench(
     help_all: opts.HelpAll = False,
     as_json: opts.AsJson = False,
 ) -> None:
-    """Run a suite: every tracker on every sequence with every seed; a second call continues an interrupted one."""
+    """Run a suite: every tracker on every sequence with every seed; called again it goes on."""
     from dynslam_bench.api import bench as run_suite
     from dynslam_bench.sequences.catalogue import parse_frames
 
