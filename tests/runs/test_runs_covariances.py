@@ -12,6 +12,7 @@ from dynslam_bench.envs.episode import FrameOutcome
 from dynslam_bench.geometry import Trajectory, write_tum
 from dynslam_bench.geometry.motion_covariances import read_motion_covariances
 from dynslam_bench.runs import RunSpec, RunStore, run_one, score
+from dynslam_bench.runs.bank import Bank
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog, FrameRow
 from dynslam_bench.runs.layout import COVARIANCES
 from dynslam_bench.runs.rows import make_run_row
@@ -110,6 +111,12 @@ def test_runs_score_covariances_and_state_their_faults(
         assert not about
         assert 0.2 < metrics.metrics["nees_1f_mean"] < 3
         assert "within the 95 % ellipsoid" in covariance_words(make_run_row(record, metrics))
+        # a bank holds all that scores are computed from
+        bank = Bank(tmp_path / "bank")
+        bank.prepare()
+        copied = bank.copy_from(store, record)
+        assert bank.changed(copied) == ""
+        assert score(bank, copied).metrics["nees_1f_mean"] == metrics.metrics["nees_1f_mean"]
         return
     (line,) = about
     assert re.search(words, line)
