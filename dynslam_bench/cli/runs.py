@@ -421,9 +421,9 @@ def covariance_words(row: Mapping[str, Any]) -> str:
     """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
     parts = []
     for span, over in (("1f", "one frame"), ("1s", "one second")):
-        ratio = row[f"nees_{span}_mean"]
+        ratio = row.get(f"nees_{span}_mean")
         if ratio is not None:
-            within = row[f"within95_{span}"]
+            within = row.get(f"within95_{span}", 0.0)
             parts.append(
                 f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
             )
