@@ -29,6 +29,8 @@ MOST_WORKERS = 8
 """Worker processes of one report at most."""
 _AT_ONCE = 40
 """Jobs that a worker takes at once."""
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Threads of numerical libraries: there is a worker a core already, and their matrices are small."""
 _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[1:]; import pickle, signal; "
     "signal.signal(signal.SIGINT, signal.SIG_IGN); pickle.load(sys.stdin.buffer)()"
@@ -87,7 +89,10 @@ class WorkerPool:
 def _start_worker() -> "subprocess.Popen[bytes]":
     """Start a worker that imports modules from where the caller does."""
     command = [sys.executable, "-c", _PROGRAM, *sys.path]
-    worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    environment = os.environ | dict.fromkeys(_THREADS, "1")
+    worker = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+    )
     with suppress(BrokenPipeError):  # it has died; the first call tells
         _send(worker.stdin, serve)
     return worker
