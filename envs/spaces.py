@@ -273,7 +273,7 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
 """Name and meaning of every entry of the ``stats`` observation, in order. What a tracker does not report is 0."""
 
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
-"""Which entries of ``stats`` may be negative, bool ``[24]``."""
+"""Flags ``[24]`` of the entries of ``stats`` that may be negative."""
 
 
 def stats_space() -> spaces.Box:

@@ -14,8 +14,8 @@ from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
     FLOOR_M,
+    ComparisonVerdict,
     PairedRatio,
-    Verdict,
     findings,
     paired_ratio,
     verdict_of,
@@ -56,7 +56,7 @@ class Comparison:
     """
 
     overall: dict[str, PairedRatio]
-    verdicts: dict[str, Verdict]
+    verdicts: dict[str, ComparisonVerdict]
     findings: dict[str, list[str]]
     table: Table
     only_a: int
@@ -244,7 +244,7 @@ def _write_page(
 def _board_data(
     cells: Mapping[str, Mapping[str, TrackerOnSequence]], evaluated: str, paged: Collection[str]
 ) -> dict[str, Any]:
-    """What ``data/board.js`` holds, see `html.board_page.board_data`; of every cell the typical run is listed.
+    """Content of ``data/board.js``, see `html.board_page.board_data`; of every cell the typical run is listed.
 
     Args:
         cells: Label to sequence to cell, A and B of each tracker after each other.

@@ -462,7 +462,7 @@ _QUANTITIES = (
 
 
 def quantity(name: str) -> Cost:
-    """What a study limits, as a function of an outcome: a field, or ``time:STAGE`` in milliseconds.
+    """Function that computes a limited quantity of an outcome: a field, or ``time:STAGE`` in milliseconds.
 
     Raises:
         StudyError: There is none of that name.

@@ -1,4 +1,4 @@
-"""What a study searches: settings with their ranges and choices, the tracker among them, and when each one counts.
+"""Search space of a study: settings with their ranges and choices, the tracker among them, and when each one counts.
 
 A setting is proposed only where it has an effect: where the chosen tracker has it, where its group is
 enabled, where the other values chosen do not switch it off (`core.settings.why_unused`), and where the
@@ -311,7 +311,7 @@ def _check_value(parameter: Parameter, value: Scalar, settings: Settings, what: 
 
 
 def _merged(one: Parameter, other: Parameter) -> Parameter:
-    """What two trackers that have a setting of the same name both take.
+    """Merge a setting that two trackers share into one with the values that both take.
 
     Raises:
         StudyError: They share no values.

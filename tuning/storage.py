@@ -390,7 +390,7 @@ _START_TIME = 19
 
 @cache
 def _machine() -> str:
-    """Where process numbers are the same: the host, and on Linux its boot and the namespace, e.g. of a container."""
+    """Name of the place in which process numbers are unique: the host, and on Linux its boot and namespace."""
     names = [socket.gethostname()]
     with suppress(OSError):
         names.append(Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8])

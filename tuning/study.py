@@ -55,7 +55,7 @@ from dynslam_bench.tuning.objectives import (
     outcome,
     own_objective,
 )
-from dynslam_bench.tuning.plan import Plan, design_of
+from dynslam_bench.tuning.plan import StudyPlan, design_of
 from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
@@ -139,7 +139,7 @@ class Evaluation:
     values: list[float] | None = None
 
 
-class Study(Plan):
+class Study(StudyPlan):
     """A study to be run: at once, or trial by trial with `ask`, `evaluate` and `tell`.
 
     Example:
@@ -663,7 +663,7 @@ class Study(Plan):
         return any(trial.user_attrs.get("worker") != worker_name() for trial in running)
 
     def _beginnings(self) -> Iterator[FrozenTrial | dict[str, Scalar]]:
-        """What a new study knows of earlier ones (trials), and what it tries after its baseline (settings)."""
+        """Trials of earlier studies that a new one knows, and settings that it tries after its baseline."""
         for entry in self.spec.start:
             if isinstance(entry, str) and Path(entry).expanduser().is_dir():
                 yield from self._earlier(Path(entry).expanduser())
@@ -781,11 +781,11 @@ class Study(Plan):
             time.sleep(0.05)
 
     def _is_half_begun(self, study: optuna.Study) -> bool:
-        """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
+        """Whether a process of this toolkit began the stored study and was killed before it had an identity."""
         facts = study.user_attrs
         if "identity" in facts:
             return False
-        # as a storage holds it: tuples are lists there
+        # another program's study has trials or attributes of its own; tuples are lists in a storage
         spec = json.loads(json.dumps(self.spec.for_others()))
         is_empty = not facts and not study.get_trials(deepcopy=False)
         return facts.get("spec") == spec or is_empty

@@ -39,7 +39,7 @@ _OPTIONS = {
     "degrade": _STRENGTHS,
     "noise": "[0-9]{1,9}",
 }
-"""What may stand behind the question mark, and how its value is written."""
+"""Options behind the question mark of an id, and how their values are written."""
 _FORM = (
     'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
 )
@@ -200,9 +200,10 @@ def _rendered_names(name: str, options: dict[str, str], text: str) -> list[str]:
 
 
 def scene_of(name: str) -> str:
-    """What a sequence's name stands for, as far as the name alone tells (see `plan.check_splits` for the content).
+    """Scene that a sequence's name stands for, as far as the name alone tells.
 
-    The frames that are taken of a sequence, and the draw of its noise, make no other scene.
+    `plan.check_splits` looks at the content. The frames that are taken of a sequence, and the draw
+    of its noise, make no other scene.
     """
     if name.startswith("synthetic/"):
         try:
@@ -371,7 +372,7 @@ class Range(Record, frozen=True):
 
 
 class SpaceSpec(Record, frozen=True):
-    """Which settings are tuned, in which ranges, and when.
+    """Settings that are tuned, their ranges, and when.
 
     From Python it may also be a plain mapping of names to `optuna.distributions`.
 

@@ -1,4 +1,4 @@
-"""What commands write: tables for people, JSON for scripts, progress on standard error."""
+"""Output of commands: tables for people, JSON for scripts, progress on standard error."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VERIFICATION_FAILED = 4
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
 _GAP = "  "
-"""What separates the columns of a table."""
+"""Gap between the columns of a table."""
 _BAR_WIDTH = 20
 """Characters of a progress bar, so that count, time and some of the step fit into 80 columns."""
 _LINE_WIDTH = 120
@@ -137,7 +137,7 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
 
 
 def _as_json(value: Any) -> Any:
-    """What JSON holds for a type that pydantic does not know: an array's numbers, else its text."""
+    """Convert a value of a type that pydantic does not know for JSON: an array to its numbers, else to its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 

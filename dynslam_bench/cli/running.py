@@ -303,7 +303,7 @@ def bench(
     help_all: opts.HelpAll = False,
     as_json: opts.AsJson = False,
 ) -> None:
-    """Run a suite: every tracker on every sequence with every seed; a second call continues an interrupted one."""
+    """Run a suite: every tracker on every sequence with every seed; called again it goes on."""
     from dynslam_bench.api import bench as run_suite
     from dynslam_bench.sequences.catalogue import parse_frames
 
@@ -477,15 +477,18 @@ class WatchedRuns:
     def __init__(
         self, store: runs.RunStore, jobs: int, protocol: str, folders: Iterable[str] = ()
     ) -> None:
+        from dynslam_bench.runs.spec import place_of
+
         self.store = store
-        self._to_announce = set(folders)
+        # as the runs name them
+        self._to_announce = set(map(place_of, folders)) - {""}
         self.jobs = jobs
         self.protocol = protocol
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
         # frames of all runs that are made, of those that have ended, and of running ones
-        self._planned = runs.Plan()
+        self._planned = runs.PlannedRuns()
         self._done = 0
         self._running: dict[str, int] = {}
         self._ended_runs = 0
@@ -513,7 +516,7 @@ class WatchedRuns:
         done = self._done + sum(self._running.values())
         self._advance(done, self._planned.frames.total() or None, step)
 
-    def _plan(self, plan: runs.Plan) -> None:
+    def _plan(self, plan: runs.PlannedRuns) -> None:
         self._planned = plan
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
@@ -574,7 +577,7 @@ def event_text(event: runs.RunEvent) -> str:
     return f"{text}, writing {', '.join(files)}"
 
 
-def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
+def describe_plan(plan: runs.PlannedRuns, store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
     from dynslam_bench.core.fingerprint import this_machine  # loads numpy
 

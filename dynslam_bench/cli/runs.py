@@ -67,7 +67,7 @@ COLUMNS = {
     "from the store": "from_store",
     "study": "study",
 }
-"""Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+"""Headings of the table, the most important first, and the names of what stands below them (see `make_run_row`)."""
 _IN_METRES = ("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m")
 """Errors of a row in metres, which are shown in millimetres."""
 MOST_REMARKS = 10
@@ -84,7 +84,7 @@ COLOURS = {
     "invalid": 31,
 }
 """Colours of the statuses on a terminal, as ANSI codes."""
-# Columns that `runs list` sorts by, and the names of those in a row that differ (see `run_row`).
+# Columns that `runs list` sorts by, and the names of those in a row that differ (see `make_run_row`).
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
@@ -403,18 +403,31 @@ def show_runs(
         reused: Ids of the runs that are marked as taken from the store.
 
     Returns:
-        The table's rows, see `run_row`.
+        The table's rows, see `make_run_row`.
     """
     rows = []
     for record in records:
         # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
-        rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
+        rows.append(stored.make_run_row(record, metrics) | {"from_store": record.run_id in reused})
     if len(rows) == 1 and not json_mode():
         show_run(rows[0], store)
     else:
         show_rows(rows, store, protocol)
     return rows
+
+
+def covariance_words(row: Mapping[str, Any]) -> str:
+    """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
+    parts = []
+    for span, over in (("1f", "one frame"), ("1s", "one second")):
+        ratio = row[f"nees_{span}_mean"]
+        if ratio is not None:
+            within = row[f"within95_{span}"]
+            parts.append(
+                f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
+            )
+    return ", ".join(parts)
 
 
 def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
@@ -442,6 +455,7 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     facts = {
         "ATE": error,
         "false motion": "" if false_motion is None else f"{mm(false_motion)} mm at most",
+        "covariances": covariance_words(row),
         "tracked": record.poses_words,
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
@@ -486,7 +500,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    """Lines below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")

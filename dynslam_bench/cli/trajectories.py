@@ -26,7 +26,7 @@ from dynslam_bench.cli.runs import show_runs
 
 if TYPE_CHECKING:
     from dynslam_bench.evaluation import Evaluation, Hint
-    from dynslam_bench.geometry import TumFile
+    from dynslam_bench.geometry import LoadedTrajectory
 
 protocols = typer.Typer(
     help="How errors are measured, and how much that alone changes.", no_args_is_help=True
@@ -89,7 +89,10 @@ def evaluate(
 
 
 def draw(
-    labels: list[str], pairs: list[tuple[TumFile, TumFile]], protocol: str, path: Path
+    labels: list[str],
+    pairs: list[tuple[LoadedTrajectory, LoadedTrajectory]],
+    protocol: str,
+    path: Path,
 ) -> Path:
     """Draw estimates beside their common ground truth; see `plot_trajectories`."""
     import numpy as np
@@ -112,7 +115,7 @@ def draw(
 
 def read_pair(
     estimate: Path, ground_truth: Path, timestamps: Path | None, topics: list[str] | None
-) -> tuple[TumFile, TumFile]:
+) -> tuple[LoadedTrajectory, LoadedTrajectory]:
     """An estimate and its ground truth; of several topics the first is the estimate's, the last the truth's."""
     topics = topics or []
     loaded = runs.read_trajectory(estimate, timestamps, *topics[:1])
@@ -121,7 +124,7 @@ def read_pair(
 
 
 def scored_with_hints(
-    loaded: TumFile, truth: TumFile, protocol: str
+    loaded: LoadedTrajectory, truth: LoadedTrajectory, protocol: str
 ) -> tuple[Evaluation, tuple[Hint, ...]]:
     """The evaluation of a file under a protocol, and the hints on it."""
     from dynslam_bench.evaluation import get_protocol, hints
@@ -134,7 +137,7 @@ def scored_with_hints(
 
 
 def remarks(result: Evaluation, likely: tuple[Hint, ...]) -> list[str]:
-    """What a reader of the numbers needs to know, a line each."""
+    """Diagnostics, warnings and hints on an evaluation, one a line."""
     return [
         *result.diagnostics,
         *(f"warning: {line}" for line in result.warnings),

@@ -1,4 +1,4 @@
-"""Which files a program is made of: its code, and the data files beside it that its code names."""
+"""Files that a program is made of: its code, and the data files beside it that its code names."""
 
 import ast
 import os
@@ -52,7 +52,7 @@ _ELF = b"\x7fELF"
 _NAME_IN_BINARY = re.compile(rb"[\w./~+\-]{1,300}\.[A-Za-z]\w{0,9}")
 """The name of a file with an ending."""
 _WORD = re.compile(rb"[\w./~+\-]+")
-"""What could be a path, quoted or not."""
+"""A word that could be a path, quoted or not."""
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")

@@ -38,7 +38,7 @@ _DIGITS = 32
 """Hexadecimal digits of each digest in a name: two of 10^9 states would share 32 with a probability of 10^-21."""
 
 _NO_FOLDER = (OSError, RuntimeError)
-"""What is raised where sources cannot be read, or where the user has no home folder."""
+"""Errors raised where sources cannot be read, or where the user has no home folder."""
 
 KERNELS: dict[FunctionType, Foreign] = {}
 """The kernels of this process that may lie on disk, by their Python functions."""

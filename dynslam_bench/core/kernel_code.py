@@ -1,4 +1,4 @@
-"""What is compiled into a kernel, as a digest.
+"""Digest of the code that is compiled into a kernel.
 
 A kernel's machine code holds the kernels that it calls, the constants that they use, wherever these
 are defined, and vector instructions. Kernels and constants are described as they are in

@@ -1,4 +1,4 @@
-"""What foreign code read while a run was made, and whether it is still the same.
+"""Files, variables and modules that foreign code read while a run was made, and whether they are still the same.
 
 A run is valid as long as all that it read is unchanged. `runs.process.recorder` records what
 plug-ins and programs read. This module holds the record (`Reads`) and compares it with what is
@@ -21,7 +21,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from dynslam_bench.core.fingerprint import path_digest
-from dynslam_bench.core.programs import folders_of
+from dynslam_bench.core.programs import folders_of, is_counted
 from dynslam_bench.core.records import Record, digest
 
 ABSENT = ""
@@ -34,6 +34,8 @@ SEARCH_PATHS = ("PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD")
 """Environment variables whose folders count in their order (`Reads.search`)."""
 COMMAND = "command "
 """Begins, in `Reads.search`, the name of a command that was looked up on ``PATH``."""
+ALL_VARIABLES = "all names"
+"""Stands, in `Reads.environment`, for the names of all variables that are set; it comes after each ``$NAME``."""
 BYTE_CODE_FOLDER = "__pycache__"
 """Python writes it beside every source that it imports; its content tells nothing that the sources do not."""
 _SETTLED_NS = 2_000_000_000
@@ -42,8 +44,6 @@ _METADATA = (".dist-info", ".egg-info")
 """How the names of folders end that hold a distribution's metadata."""
 _NOT_CONTENT = ("..", ".pyc", ".dist-info")
 """Lines of a distribution's RECORD with these differ between installations of the same files."""
-_FIRST_PART = re.compile("^[^/,\\n]+", re.MULTILINE)
-"""The first folder, or the file itself, of each line of a RECORD."""
 _SUFFIXES = tuple(importlib.machinery.all_suffixes())
 """How files end that Python imports as modules."""
 
@@ -57,7 +57,7 @@ Entries = Annotated[dict[str, str], AfterValidator(_sorted)]
 
 
 class Reads(Record):
-    """What foreign code read, by name; the digest `ABSENT` stands for what was not there.
+    """Digests of what foreign code read, by name; `ABSENT` stands for what was not there.
 
     Names of files begin in the folders of `BaseFolders`.
 
@@ -67,7 +67,9 @@ class Reads(Record):
         folders: Digest of the names in each folder that was listed.
         links: Where each file or folder lies that was reached through symbolic links.
         environment: Digest of the value of each environment variable, by ``$NAME``. Values may be
-            secrets: eight digits show that one has changed and are too few to find it.
+            secrets: eight digits show that one has changed and are too few to find it. Where all
+            variables were listed, the digest of their names, too, by `ALL_VARIABLES`: code that
+            looks for names with a beginning sees one that is set later.
         search: The paths on which libraries and modules are searched; what each command was found
             to be.
         modules: Where each module that was asked for was found, by its top-level name.
@@ -216,6 +218,11 @@ def link_now(path: str, base_folders: BaseFolders) -> str:
 def value_digest(value: str | None) -> str:
     """Digest of an environment variable's value; `ABSENT` where it is not set."""
     return ABSENT if value is None else digest(value, 8)
+
+
+def variables_now(environment: Mapping[str, str]) -> str:
+    """Digest of the names of the variables that are set, of those whose values count."""
+    return digest_of_names(sorted(filter(is_counted, environment)))
 
 
 def search_now(name: str, environment: Mapping[str, str], base_folders: BaseFolders) -> str:
@@ -387,7 +394,10 @@ def _top_level_names(metadata: str) -> set[str]:
 
 def _first_parts(record: Path) -> set[str]:
     """The names of the modules that lie where the files of a RECORD begin."""
-    parts = set(_FIRST_PART.findall(record.read_text(encoding="utf-8", errors="replace")))
+    # the first folder, or the file itself, of each line
+    lines = record.read_text(encoding="utf-8", errors="replace").split("\n")
+    parts = {line.partition("/")[0] for line in lines}
+    parts = {part.partition(",")[0] for part in parts}
     modules = {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)}
     return modules - {"", BYTE_CODE_FOLDER}
 
@@ -439,6 +449,8 @@ class Verifier:
         match section:
             case "search":
                 return search_now(name, self._environment, base_folders)
+            case "environment" if name == ALL_VARIABLES:
+                return variables_now(self._environment)
             case "environment":
                 return value_digest(self._environment.get(name.removeprefix("$")))
             case "modules":
@@ -473,6 +485,8 @@ def _in_words(section: str, name: str, before: str) -> str:
             return f"the place of the {name}"
         case "search":
             return name
+        case "environment" if name == ALL_VARIABLES:
+            return "the list of environment variables"
         case "environment":
             return f"the environment variable {name.removeprefix('$')}"
         case "modules":

@@ -28,7 +28,7 @@ from dynslam_bench.core.reading import read_npz
 ReadsSoFar = Callable[[], str]
 """Gives a digest of all that the plug-ins of this process have read so far."""
 _RECORDING: list[ReadsSoFar] = []
-"""What `record_reads` was given, in a list of one; empty where nothing records."""
+"""The record given to `record_reads`, in a list of one; empty where nothing records."""
 
 
 def record_reads(reads_so_far: ReadsSoFar) -> None:

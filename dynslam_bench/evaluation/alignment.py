@@ -149,7 +149,12 @@ _ON_A_LINE = 1e-12
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:
-    """Rotation that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it."""
+    """Rotation R ``[3, 3]`` that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it.
+
+    Args:
+        covariance: C ``[3, 3]``, of the true positions with the estimated ones, without units.
+        orientation: Mean of true times inverse estimated orientations ``[3, 3]``.
+    """
     # where the positions lie on a line or in a point, the orientations decide what is left open
     u, singular, vt = np.linalg.svd(covariance)
     degenerate = bool(singular[1] <= _ON_A_LINE * singular[0])
@@ -163,7 +168,13 @@ def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, flo
 
 
 def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
-    """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it."""
+    """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it.
+
+    Args:
+        covariance: C, as in `_nearest_rotation`.
+        orientation: As in `_nearest_rotation`; it decides where C does not.
+    """
+    # tr(R^T C) = cos(angle) (C_xx + C_yy) + sin(angle) (C_yx - C_xy) + C_zz
     degenerate = (
         np.hypot(covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]) < 1e-15
     )

@@ -9,7 +9,7 @@ from typing import TypeVar
 from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_loaded
 from dynslam_bench.evaluation.protocol import PROTOCOLS, Alignment, Protocol, RPESpec
-from dynslam_bench.geometry import Trajectory, TumFile
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ComparisonRow:
     note: str = ""
 
 
-P = TypeVar("P", Trajectory, TumFile)
+P = TypeVar("P", Trajectory, LoadedTrajectory)
 
 
 def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:

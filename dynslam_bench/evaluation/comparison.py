@@ -386,6 +386,12 @@ def apply_policy(
 ) -> tuple[Trajectory, NDArray[np.bool_] | None]:
     """The estimate with its lost frames held or left out, as the protocol has it.
 
+    Args:
+        estimate: Camera-to-world poses as the tracker gave them.
+        protocol: Its `lost_frames` policy is applied.
+        input_timestamps: Stamps of all input frames, seconds; None if they are not known.
+        diagnostics: Gains a line on what was held or left out.
+
     Returns:
         The estimate, and which input frames were tracked ``[N]``; None where the input frames are
         not known.
@@ -448,7 +454,7 @@ def share_of_time(stamps: ArrayLike, true_stamps: ArrayLike) -> float:
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
-    """Which input frames ``[N]`` have a pose in the estimate.
+    """Flags ``[N]`` of input frames that have a pose in the estimate.
 
     A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some
     systems write the depth image's stamp, and files round.

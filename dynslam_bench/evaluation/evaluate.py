@@ -26,7 +26,14 @@ from dynslam_bench.evaluation.comparison import (
 from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
-from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
+from dynslam_bench.evaluation.uncertainty import (
+    NO_NOISE,
+    PoseNoise,
+    Uncertainty,
+    motion_uncertainty,
+)
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory, load_trajectory
+from dynslam_bench.geometry.motion_covariances import MotionCovariances
 
 SCHEMA_VERSION = 1
 METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
@@ -65,7 +72,8 @@ class Evaluation(Record):
             move scores under the same alignment. The statistics are rmse, mean, median, std, min,
             max, sse. Where the true camera stands still, the false motion: ``false_motion_path_m``,
             the length of the estimated path, and ``false_motion_max_m``, its largest distance from
-            its first pose.
+            its first pose. Where the tracker gave covariances of its motions, their scores, see
+            `Uncertainty`.
         n_pairs: Pairs of poses that the absolute error is taken over.
         n_pairs_rpe: Pairs of poses that each relative error is taken over, by its key.
         n_input: Input frames; None where they are not known.
@@ -115,6 +123,8 @@ def evaluate(
     protocol: Protocol | str = "tum-rgbd/v1",
     *,
     input_timestamps: ArrayLike | None = None,
+    motion_covariances: MotionCovariances | None = None,
+    truth_noise: PoseNoise = NO_NOISE,
 ) -> Evaluation:
     """Absolute and relative pose errors of a trajectory.
 
@@ -125,6 +135,9 @@ def evaluate(
         protocol: A protocol or the id of a registered one.
         input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the
             lost-frame policy ``hold``.
+        motion_covariances: What the tracker says of its errors, see `motion_uncertainty`; they are
+            scored with poses in metres alone.
+        truth_noise: Of the true poses, for the covariances.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is
@@ -137,6 +150,9 @@ def evaluate(
     # the policy for lost frames, then association and alignment
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []
+    uncertainty = Uncertainty()
+    if motion_covariances is not None and not protocol.finds_scale:
+        uncertainty = motion_uncertainty(estimate, motion_covariances, ground_truth, truth_noise)
     truth_share = share_of_time(estimate.timestamps, ground_truth.timestamps)
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
@@ -149,6 +165,8 @@ def evaluate(
     metrics: dict[str, float] = {}
     for measure in METRICS:
         metrics |= measure(comparison)
+    metrics |= uncertainty.metrics
+    diagnostics += uncertainty.diagnostics
     similarity = comparison.similarity
     return Evaluation(
         protocol_id=protocol.id,
@@ -171,7 +189,7 @@ def evaluate(
         ),
         association=comparison.association,
         diagnostics=diagnostics,
-        warnings=warnings_of(comparison, metrics),
+        warnings=[*warnings_of(comparison, metrics), *uncertainty.warnings],
     )
 
 
@@ -204,7 +222,7 @@ def evaluate_files(
 
 
 def evaluate_loaded(
-    estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str
+    estimate: LoadedTrajectory, ground_truth: LoadedTrajectory, protocol: Protocol | str
 ) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 

@@ -67,7 +67,7 @@ def hints(
     *,
     notes: FileNotes | None = None,
 ) -> tuple[Hint, ...]:
-    """What is probably wrong with an estimate, from its comparison with the truth.
+    """Find what is probably wrong with an estimate, by comparing it with the truth.
 
     Args:
         estimate: Camera-to-world poses, as they were read.
@@ -187,26 +187,32 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     # fine: a quarter of a step; the last one is no shift, for comparison
     fine = lag * step + np.linspace(-1, 1, 9) * step
     begin = stamps[0] + step * at
-    near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
-    now = float(near[-1])
-    near = near[:-1]
-    best = int(np.argmin(near))
+    unexplained = _unexplained(
+        moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window)
+    )
+    unshifted_share = float(unexplained[-1])
+    shares = unexplained[:-1]
+    best = int(np.argmin(shares))
     shift = float(fine[best])
-    left = float(near[best])
+    least_share = float(shares[best])
 
     # finer: the minimum of the parabola through the best and its neighbours
     if 0 < best < len(fine) - 1:
-        before = near[best - 1]
-        after = near[best + 1]
-        bend = before - 2 * left + after
-        if bend > 0:
-            shift += float(0.5 * (before - after) / bend * (fine[1] - fine[0]))
+        before = shares[best - 1]
+        after = shares[best + 1]
+        curvature = before - 2 * least_share + after
+        if curvature > 0:
+            shift += float(0.5 * (before - after) / curvature * (fine[1] - fine[0]))
 
     # clear: it explains the motion, and such a shift shows on a path of this shape
     shifted_self = _displacements(track, begin[None] + shift, window)
     visible = float(_unexplained(moved, shifted_self)[0])
-    clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
-    return (shift, left) if clear else (0.0, now)
+    clear = (
+        abs(shift) > SHORTEST_SHIFT_S
+        and least_share < min(MOSTLY, 0.55 * unshifted_share)
+        and visible > 0.3 * unshifted_share
+    )
+    return (shift, least_share) if clear else (0.0, unshifted_share)
 
 
 def _grid_places(track: Track, step: float) -> Array:
@@ -449,7 +455,7 @@ class Track:
         return poses
 
     def nearest(self, stamps: Array) -> NDArray[np.intp]:
-        """Which poses are nearest in time ``[N]``."""
+        """Indices ``[N]`` of the poses nearest in time."""
         after = np.searchsorted(self.stamps, stamps).clip(1, len(self.stamps) - 1)
         return np.asarray(after - (stamps - self.stamps[after - 1] < self.stamps[after] - stamps))
 
@@ -582,7 +588,14 @@ def _wrong_convention(
 def _in_axes_of_a_body(
     poses: Array, pairs: NDArray[np.intp], true: Array, true_poses: Array
 ) -> list[tuple[float, Convention, Array]]:
-    """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one."""
+    """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one.
+
+    Args:
+        poses: Estimated poses ``[N, 4, 4]``.
+        pairs: Pairs of poses ``[P, 2]`` whose motions are compared.
+        true: True motions ``[P, 4, 4]`` of these pairs.
+        true_poses: True poses ``[N, 4, 4]``.
+    """
     motions = se3.between(poses, pairs)
     as_turned, _ = _compare(motions, true, R_est_cam=_axes(motions, true))
     # of the conventions only the first two, in axes that are fitted

@@ -1,4 +1,4 @@
-"""What makes the numbers of an evaluation doubtful: values that nobody could mean, too little truth.
+"""Warnings on doubtful evaluations: values that nobody could mean, too little truth.
 
 Hints look for one fault that explains a whole trajectory. A warning states a measured fact and
 changes no number. Like a hint it is one line that begins with its id: ``frame-numbers``,

@@ -69,7 +69,7 @@ class GateResult(Record):
 
     Attributes:
         schema_version: Version of this record's fields.
-        verdict: Verdict on the error.
+        verdict: Verdict on error and guardrails. *identical*, *improved* and *no difference* pass.
         exit_code: 0 passed, 3 runs failed, 4 regressed or a guardrail is broken, 5 undecided.
         sentence: The verdict in words.
         question: Digest of the question.

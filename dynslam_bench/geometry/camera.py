@@ -130,6 +130,7 @@ class Camera:
             return pixels
         import cv2
 
+        # at most 20 iterations, until a step is below 1e-9
         coefficients = np.asarray(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
         # the distortion is inverted by iteration; older OpenCV has criteria under another name

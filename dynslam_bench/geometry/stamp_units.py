@@ -36,7 +36,7 @@ class StampUnit:
 
 
 SECONDS = StampUnit("seconds", "s", 0)
-"""What TUM's format prescribes."""
+"""The unit that TUM's format prescribes."""
 UNITS = (
     SECONDS,
     StampUnit("milliseconds", "ms", 3),

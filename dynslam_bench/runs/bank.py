@@ -42,6 +42,7 @@ from dynslam_bench.runs.exchange.transfer import import_trajectory
 from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, TrajectoryKind, Unreadable
 from dynslam_bench.runs.record import RunRecord, run_id_of
 from dynslam_bench.runs.store import Merged, RunStore, open_store
+from dynslam_bench.sequences.synthetic import parse_synthetic_id
 
 SUMS = "SHA256SUMS"
 """The list of checksums, in the format of ``sha256sum -c``."""
@@ -283,7 +284,7 @@ def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
 
 
 def _faults_of_run(store: Bank, record: RunRecord, listed: Collection[str]) -> list[str]:
-    """What is wrong with a run whose record can be read.
+    """Faults of a run whose record can be read.
 
     Args:
         store: The bank.
@@ -317,11 +318,21 @@ def _contradicted(record: RunRecord) -> list[str]:
         "tracker": record.tracker.id,
         "tracker_version": record.tracker.version,
         "drop_share": record.drop_share,
-        "sequence": record.sequence.id,
+        "sequence": _without_length(record.sequence.id),
         "content": record.sequence.content,
         "degrade": record.degrade,
     }
     return [name for name, value in stated.items() if record.identity.get(name, value) != value]
+
+
+def _without_length(sequence: str) -> str:
+    """The id that an identity has: of a rendered sequence without its length, whose frames stand beside it."""
+    if not sequence.startswith("synthetic/"):
+        return sequence
+    try:
+        return parse_synthetic_id(sequence).whole
+    except DynslamError:  # of a family that this release does not have
+        return sequence
 
 
 def pull(source: str, bank: str | Path) -> Merged:

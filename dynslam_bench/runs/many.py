@@ -75,7 +75,7 @@ class RunEvent:
 
 
 @dataclass
-class Plan:
+class PlannedRuns:
     """Runs and frames that a call of `run_many` is to make.
 
     Attributes:
@@ -94,7 +94,7 @@ def run_many(
     jobs: int = 1,
     executor: Executor | None = None,
     retry: Collection[str] = (),
-    on_plan: Callable[[Plan], None] | None = None,
+    on_plan: Callable[[PlannedRuns], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
@@ -168,7 +168,7 @@ class _ManyRuns:
     store: RunStore
     protocol: Protocol
     jobs: int
-    on_plan: Callable[[Plan], None] | None
+    on_plan: Callable[[PlannedRuns], None] | None
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
     cancelled: Callable[[], bool]
@@ -193,7 +193,7 @@ class _ManyRuns:
         """
         resolver = Resolver()
         stored_runs = LookUp(self.store)
-        plan = Plan()
+        plan = PlannedRuns()
         looked_up: set[str] = set()
         for spec in specs:
             run = self._resolve(resolver, spec)
@@ -382,7 +382,7 @@ class _ManyRuns:
 
 
 def _answer_of(ask: Callable[..., T], *arguments: object) -> T:
-    """What an executor answers; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
+    """Call an executor; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
     try:
         return ask(*arguments)
     except DynslamError:

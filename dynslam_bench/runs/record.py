@@ -1,4 +1,4 @@
-"""What is kept of a run: `run.json`, which `store` writes, and the metrics, which lie apart in the index."""
+"""Records of runs: `run.json`, which `store` writes, and the metrics, which lie apart in the index."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ ASKED = (
     "drop_share",
     "degrade",
 )
-"""What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
+"""Entries of an identity that were asked for; all others were read: code, data, weights, libraries, files."""
 _CODE_ENTRIES = ("tracker_version", "source", "requires", "files", "reads")
-"""What of an identity says by which code the run was made."""
+"""Entries of an identity that tell the code that made the run."""
 PROGRAM = ("parts", *_CODE_ENTRIES, "libraries", "weights")
-"""What of an identity says by which program the run was made: its code, libraries and weights."""
+"""Entries of an identity that tell the program that made the run: its code, libraries and weights."""
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5
@@ -61,11 +61,14 @@ def digest_of_request(identity: Mapping[str, Any]) -> str:
     return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
 
+def digest_of_reads(identity: Mapping[str, Any]) -> str:
+    """The last eight digits of a run's id: what was read for it, which is all that was not asked for."""
+    return digest({name: value for name, value in identity.items() if name not in ASKED}, 8)
+
+
 def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
-    # all that was not asked for was read
-    read = {name: value for name, value in identity.items() if name not in ASKED}
-    return digest_of_request(identity) + digest(read, 8)
+    return digest_of_request(identity) + digest_of_reads(identity)
 
 
 def coverage_text(coverage: float | None, truth_share: float | None = None) -> str:
@@ -309,7 +312,7 @@ class RunRecord(Record):
 
     @property
     def reads(self) -> Reads | None:
-        """What the plug-ins and programs of the run read; None for a run without such, or where it is not known."""
+        """Digests of what the run's plug-ins and programs read; None for a run without such, or if not known."""
         stored = self.identity.get("reads")
         return None if stored is None else Reads.model_validate(stored)
 
@@ -320,7 +323,7 @@ class RunRecord(Record):
 
     @property
     def program(self) -> dict[str, str]:
-        """What made the run beside its settings: code, weights and library versions, by name, as short texts."""
+        """Code, weights and library versions that made the run, by name, as short texts."""
         made = program_of(self.identity) if self.kind == "run" else {}
         return made if self.verified else made | {"identity": "unverified"}
 
@@ -379,7 +382,7 @@ class RunRecord(Record):
 
     @property
     def repeat(self) -> str:
-        """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
+        """Name of the repeat of its block that the run is, e.g. ``seed 0, offset 2``."""
         words = [f"seed {self.seed}"]
         if self.offset:
             words.append(f"offset {self.offset}")
@@ -447,7 +450,7 @@ class MetricRecord(Record):
 
     @property
     def remarks(self) -> list[str]:
-        """What to know before the numbers are believed, a line each: warnings on the primary evaluation, and hints."""
+        """Warnings on the primary evaluation, then hints, one a line."""
         warnings = [] if self.primary is None else self.primary.warnings
         return [
             *(f"warning: {line}" for line in warnings),

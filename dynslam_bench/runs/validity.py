@@ -15,16 +15,17 @@ from dynslam_bench.runs.identity import libraries, source_digests
 from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.trackers.registry import TRACKERS
 
 NOT_RECORDED = "its record does not say what it was made by"
-_NETWORKS = ("embedded", "coco")
+_NETWORKS = ("embedded", *CHECKPOINTS)
 """Weights that no setting names, see `build_segmenter.weights_digest`."""
 
 
 class Installation:
-    """What is installed here; each thing is looked at once, however many runs are compared with it.
+    """The installed programs; each thing is looked at once, however many runs are compared with it.
 
     No plug-in is imported. A run's data are no part of the comparison: runs on other data are other
     columns of a table.
@@ -36,7 +37,7 @@ class Installation:
         self._answers: dict[str, str] = {}
 
     def what_changed(self, record: RunRecord) -> str:
-        """What of a run's program is another one here, in a few words; empty where the program is the one installed.
+        """Name what differs between a run's program and the installed one, in a few words; empty where nothing does.
 
         Imported trajectories have no program that could change.
         """
@@ -103,7 +104,7 @@ class Installation:
         return self._what_was_read(program, plugin) if runs_foreign_code else ""
 
     def _what_was_read(self, program: Mapping[str, Any], plugin: Path | None) -> str:
-        """What has changed of all that plug-ins and programs read."""
+        """Name what has changed of all that plug-ins and programs read."""
         try:
             reads = Reads.model_validate(program.get("reads"))
         except ValidationError:

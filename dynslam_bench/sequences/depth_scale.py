@@ -215,7 +215,15 @@ def _turning_rates(truth: TruthMotion, stamps: Array) -> Array:
 def _at_middle_row(
     points: Array, pixels: Array, rate: Array, camera: Camera, readout_s: float
 ) -> Array:
-    """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows."""
+    """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows.
+
+    Args:
+        points: In the camera at the times of their rows, metres.
+        pixels: Their raw pixels ``[N, 2]``, which tell the rows.
+        rate: Turning rate ``[3]`` of the camera, rad/s in its axes.
+        camera: Its height.
+        readout_s: Seconds from the first row to the last.
+    """
     late = ((pixels[:, 1] + 0.5) / camera.height - 0.5) * readout_s
     return np.asarray(np.einsum("nij,nj->ni", _rotation(late[:, None] * rate), points))
 

@@ -1,4 +1,4 @@
-"""Which sequences go together: those of one family film one kind of scene, those of one path are one recording."""
+"""Groups of sequences: those of one family film one kind of scene, those of one path are one recording."""
 
 import numpy as np
 from scipy.spatial import cKDTree

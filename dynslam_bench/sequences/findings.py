@@ -1,4 +1,4 @@
-"""What a check of a recording can find: the table of findings, with their texts and what to change."""
+"""The table of findings that a check of a recording can make, with their texts and what to change."""
 
 from __future__ import annotations
 

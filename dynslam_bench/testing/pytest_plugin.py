@@ -26,7 +26,7 @@ OPTIONS = {
     "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
     "sequence": "a sequence: id, folder, or module:Attr or file.py:Attr of a DatasetSpec (the first that it lists)",
 }
-"""What can be checked: the end of the option's name, and its help."""
+"""Plug-ins that can be checked: the end of the option's name, and its help."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

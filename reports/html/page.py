@@ -156,7 +156,7 @@ def figure_json(figure: go.Figure) -> Markup:
 
 
 def read_remark(output: Path, name: str) -> Any:
-    """What stands in the first line of ``data/<name>.js``, see `write_side`; None without that file."""
+    """Read the first line of ``data/<name>.js``, see `write_side`; None without that file."""
     with (
         suppress(OSError, ValueError),
         (output / FOLDER / f"{name}.js").open(encoding="utf-8") as file,

@@ -452,6 +452,10 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
         ("ATE of the final trajectory", row.final_ate_m, 1000, " mm"),
         ("false motion, farthest", row.metrics.get("false_motion_max_m"), 1000, " mm"),
         ("false motion, path", row.metrics.get("false_motion_path_m"), 1000, " mm"),
+        ("NEES / 6 of the covariances, one frame", row.metrics.get("nees_1f_mean"), 1, ""),
+        ("within the 95 % ellipsoid, one frame", row.metrics.get("within95_1f"), 100, " %"),
+        ("NEES / 6 of the covariances, one second", row.metrics.get("nees_1s_mean"), 1, ""),
+        ("within the 95 % ellipsoid, one second", row.metrics.get("within95_1s"), 100, " %"),
         ("real time", row.real_time_factor, 1, " ×"),
         ("keyframes", record.keyframes, 1, ""),
         ("map points", record.map_points, 1, ""),
@@ -506,7 +510,7 @@ def _caption(
     pictures: Sequence[int],
     lost: Sequence[tuple[float, float]],
 ) -> list[str]:
-    """What is drawn in the pictures and over time, in sentences; nothing that is not there."""
+    """Describe what is drawn in the pictures and over time, in sentences."""
     sentences = []
     if pictures:
         drawn = []

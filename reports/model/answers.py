@@ -1,4 +1,4 @@
-"""What a board answers in millimetres: the typical error of each tracker, a sentence per category, and its limits."""
+"""Answers of a board in millimetres: the typical error of each tracker, a sentence per category, and its limits."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def typical_error(board: Board, key: str, names: Sequence[str]) -> TypicalError:
 
 
 def error_columns(board: Board) -> dict[str, list[str]]:
-    """What moves, in everyday words, to the sequences that typical errors are over.
+    """Sequences that typical errors are over, by what moves in them, in everyday words.
 
     They are those that all ranked trackers have.
 
@@ -95,7 +95,7 @@ def error_columns(board: Board) -> dict[str, list[str]]:
 
 
 def answers(board: Board) -> list[str]:
-    """What a board says in millimetres, a sentence for each of its columns of errors; none without ground truth.
+    """Sentences on a board's errors in millimetres, one a column of errors; none without ground truth.
 
     Named are the ranked trackers with the smallest typical errors, the reference, and a camera that
     does not move. Where nothing is ranked, all trackers are compared.
@@ -157,7 +157,7 @@ def _rows(board: Board, key: str, name: str) -> list[RunRow]:
 
 
 def limits(board: Board) -> str:
-    """What has to be said with the numbers of a board, in a few short sentences."""
+    """Limits of the numbers of a board, in a few short sentences."""
     rows = board.rows
     sentences = ["Medians over sequences of the absolute trajectory error."]
     sentences.append(_kind_of_data(rows))

@@ -51,7 +51,7 @@ from dynslam_bench.sequences.tags import FIXED_CAMERA
 from dynslam_bench.sequences.thumbnails import same_frames
 
 STATIC_CAMERA = "static camera (from ground truth)"
-"""What captions call the reference where it is a static camera."""
+"""Name in captions of the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
 """Tracker that errors are divided by where no other is asked for."""
 RankingBasis = Literal["common", "all"]
@@ -566,7 +566,7 @@ def rank(
 
 
 def group_of(tags: Collection[str]) -> str:
-    """What moves in a scene, by the tags of its sequence."""
+    """Group of a scene: what moves in it, by the tags of its sequence."""
     return next((group for tag, group in _GROUPS.items() if tag in tags), _OTHER)
 
 
@@ -741,7 +741,7 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: the true poses are the same, or the pictures before a fixed camera.
+    """Find sequences that are copies of others: equal true poses, or equal pictures before a fixed camera.
 
     Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
@@ -801,7 +801,7 @@ def _is_same_path(row: RunRow, other: RunRow) -> bool:
 
 
 def copies_note(board: Board) -> str:
-    """Which sequences are one recording and count once, and why; empty where none are."""
+    """Note on sequences that are one recording and count once, and why; empty where none are."""
     names = grouped(board.copies, board.copies.__getitem__)
     shown = [
         f"{first} counts once for {', '.join([first, *others])}" for first, others in names.items()

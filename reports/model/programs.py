@@ -1,4 +1,4 @@
-"""Which programs made the runs of a tracker: which of them ranks, and which have equal results and share a row.
+"""Programs that made the runs of a tracker: which of them ranks, and which have equal results and share a row.
 
 A program is code, libraries and weights. The runs of one tracker with the same settings have a row
 for each program that made some of them. The row of the program that is installed here ranks.
@@ -139,12 +139,17 @@ class ProgramRow:
         return equal >= FEWEST_EQUAL
 
     def shared_results(self) -> int:
-        """Results of runs that ended well which several of its programs have; other seeds' copies do not count."""
-        # which programs made each run
+        """Number of different good results of runs that several of the row's programs have made.
+
+        A deterministic tracker gives one result for all seeds: it counts once.
+        """
+        # the programs that made each run
         makers: dict[Repeat, set[int]] = {}
         for at, program in enumerate(self.programs):
             for row in program.rows:
                 makers.setdefault((row.sequence_key, row.repeat_key), set()).add(at)
+
+        # different results, whatever the seed
         shared = set()
         for repeat, programs in makers.items():
             column, (offset, noise, _, _) = repeat
@@ -318,7 +323,7 @@ def _merge_equal(programs: Iterable[Program]) -> list[ProgramRow]:
 
 
 def _program_text(row: RunRow) -> str:
-    """What a run's record says of its program; imports have none."""
+    """Text of a run's program, as its record states it; empty for imports."""
     if row.imported:
         return ""
     named = {name: row.identity[name] for name in ("scheme", *PROGRAM) if name in row.identity}

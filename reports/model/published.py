@@ -38,7 +38,7 @@ METRICS = (
     "rpe_1s_rot_rmse_deg",
     "coverage_percent",
 )
-"""What was published of a sequence, the error that is always sought first."""
+"""Metrics of published numbers, the error that is always sought first."""
 NOT_STATED = "not stated"
 """In place of what a source does not say."""
 RECORD = "record"
@@ -94,7 +94,7 @@ def published() -> pd.DataFrame:
 
 
 def published_for(sequences: Sequence[str], protocol: Protocol | None = None) -> pd.DataFrame:
-    """What was published of whole sequences, a line for every system and source, the lowest ATE of a sequence first.
+    """Published numbers of whole sequences, a line a system and source, the lowest ATE of a sequence first.
 
     Args:
         sequences: Ids of the sequences.

@@ -147,7 +147,7 @@ class RunRow(RunRecord):
 
     @cached_property
     def variant(self) -> dict[str, Any]:
-        """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
+        """Settings, device, threads and mode that set runs of one tracker apart besides sequence and repeat."""
         variant: dict[str, Any] = dict(sorted(self.requested_settings.items()))
         if not self.imported:
             variant |= {"device": self.device, "threads": self.threads}

@@ -403,7 +403,7 @@ class PairwiseResult(NamedTuple):
 def separable(
     logs: Mapping[str, Array], sequences: Sequences
 ) -> dict[tuple[str, str], PairwiseResult]:
-    """Which trackers the sequences tell apart, Holm-corrected over all pairs.
+    """Test which pairs of trackers the sequences tell apart, Holm-corrected over all pairs.
 
     The order of all pairs that are called separable is right together with a chance of at least
     95 %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two

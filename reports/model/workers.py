@@ -35,7 +35,7 @@ _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[1:]; import pickle, signal; "
     "signal.signal(signal.SIGINT, signal.SIG_IGN); pickle.load(sys.stdin.buffer)()"
 )
-"""What a worker runs.
+"""Program of a worker.
 
 It finds modules where the caller does, leaves Ctrl-C to the caller, and gets `serve` as first message.
 """

@@ -56,7 +56,7 @@ _PROVENANCE = {
     "external": "not part of this project",
     "control": "a control, not a system",
 }
-"""What each provenance of a tracker means: the tip of its cell."""
+"""Meaning of each provenance of a tracker: the tip of its cell."""
 _PROVENANCE_NAMES = {"own": "our composition"}
 """Provenances that tables call by another name than the tracker's spec does."""
 CACHED_MARK = "†"
@@ -66,12 +66,12 @@ COMPUTER_MARK = "‖"
 CACHED_NOTE = (
     f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 )
-"""What `CACHED_MARK` means, for captions."""
+"""Meaning of `CACHED_MARK`, for captions."""
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
     "scenes 0-99): its best case, no judgement."
 )
-"""What the mark `SEEN` means, for captions and tips."""
+"""Meaning of the mark `SEEN`, for captions and tips."""
 
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
@@ -169,7 +169,7 @@ def _leaderboard_caption(board: Board, protocol: Protocol, *, has_epipolar: bool
 
 
 def _ratio_rule(board: Board) -> str:
-    """What the ATE ratio is a mean over, and whether it has intervals."""
+    """Sentences on what the ATE ratio is a mean over, and whether it has intervals."""
     groups = dict.fromkeys(board.groups[name] for name in board.common)
     over_categories = ""
     if board.category == OVERALL and len(groups) > 1:
@@ -239,7 +239,7 @@ def _no_better_than_static_words(board: Board) -> str:
 
 
 def _hint_counts(rows: Iterable[RunRow]) -> str:
-    """What is probably wrong with trajectories, with the number of runs; empty if nothing is."""
+    """Probable faults of trajectories, each with its number of runs; empty if there are none."""
     # a hint is a line "<id>: <text>"
     counts = Counter(line.partition(":")[0] for row in rows for line in row.hints)
     return ", ".join(f"{hint} {count}" for hint, count in counts.most_common())
@@ -479,7 +479,7 @@ def frame_time_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
 
 
 def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
-    """What stands behind the times of some runs, and why: the stage cache, and other computers than most runs had."""
+    """Marks behind the times of some runs, and why: the stage cache, and other computers than most runs had."""
     marks = []
     tips = []
     if any(row.cached for row in timed_on_one(ended, board.timing_computer)):
@@ -1229,7 +1229,7 @@ LOST_MARK = "¶"
 LOST_NOTE = (
     f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
 )
-"""What `LOST_MARK` means, for captions."""
+"""Meaning of `LOST_MARK`, for captions."""
 
 
 def subject_of(board: Board) -> str | None:
@@ -1320,7 +1320,7 @@ def _percent_of_static_camera(row: RunRow) -> float | None:
 
 
 def _accuracy_percent(row: RunRow) -> float | None:
-    """What a run's error in percent of a static camera's leaves of 100 %."""
+    """Accuracy of a run: 100 % less its error in percent of a static camera's."""
     error_percent = _percent_of_static_camera(row)
     return None if error_percent is None else 100 - error_percent
 

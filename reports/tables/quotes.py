@@ -1,4 +1,4 @@
-"""What a paper or a post quotes of a board: a sentence, a LaTeX table that fits a column, and BibTeX entries."""
+"""Quotes of a board for a paper or a post: a sentence, a LaTeX table that fits a column, and BibTeX entries."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Table:
     brief: str = ""
 
     def frame(self) -> pd.DataFrame:
-        """What CSV holds, in columns named by `Column.key`.
+        """The table as CSV holds it, in columns named by `Column.key`.
 
         Numbers have all their digits, in the units that the caption and the headings name (errors
         in metres, times in milliseconds, shares from 0 to 1); other cells have their words.
@@ -376,7 +376,7 @@ def _float(table: Table, tabulars: Sequence[str], number: int, protocol: str) ->
 
 
 def _blocks(table: Table) -> list[list[int]]:
-    """Which columns stand side by side; the names of the rows stand in every block."""
+    """Columns of each block that stand side by side; the names of the rows stand in every block."""
     # the first column of texts holds the names of the rows
     shown = [at for at, column in enumerate(table.columns) if column.latex]
     names = next((at for at in shown if not table.columns[at].numeric), 0)
@@ -422,7 +422,7 @@ def _heading(name: str) -> list[str]:
 
 
 def _plain(cell: TableCell) -> str:
-    """What LaTeX shows of a cell, unescaped."""
+    """Text of a cell in LaTeX, unescaped."""
     if cell.emphasis == "failed":
         return "failed"
     text = cell.text.replace(OUR_BACK_END, "*")

@@ -102,6 +102,18 @@ def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, tmp_
     assert len(read_tum(Path(err.splitlines()[-1].rpartition(": ")[2]))) == 4
 
 
+@pytest.mark.parametrize("named", ["recording", "./recording", "{}/recording"])
+def test_what_a_folder_is_taken_for_is_said_once(cli, tmp_path, named):
+    folder = write_folder(tmp_path / "recording", 4)
+    camera = folder / "camera.toml"
+    camera.write_text(camera.read_text().replace("fps = 30", "fps = 3"))
+    code, out, err = cli("run", "never-move", named.format(tmp_path))
+    assert code == 0, err
+    assert err.count("taken for layout tum: colour in rgb") == 1
+    assert (out + err).count("fps = 3 is stated") == 1
+    assert "warning: recording: fps = 3 is stated" in out
+
+
 def test_a_folder_whose_camera_is_not_known_names_the_choices(cli, walk, tmp_path):
     shutil.copytree(walk, tmp_path / "mine")
     (tmp_path / "mine" / "camera.toml").rename("cam.toml")
@@ -456,6 +468,21 @@ def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.Mon
     with pytest.raises(KeyError), compiled_ahead():
         raise KeyError
     assert time.monotonic() - began < 300
+
+
+def test_why_kernels_were_not_compiled_ahead_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failing = [sys.executable, "-S", "-c", "raise OSError('no space left')"]
+    monkeypatch.setattr(
+        demo.subprocess,
+        "Popen",
+        lambda *_, popen=subprocess.Popen, **options: popen(failing, **options),
+    )
+    with compiled_ahead():
+        pass
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "OSError: no space left" in line
 
 
 def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):

@@ -484,6 +484,29 @@ def test_a_variable_that_is_not_set_and_looked_up_in_a_copy(copy: str, bench: Be
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
+@pytest.mark.parametrize(
+    "look",
+    [
+        "[value for name, value in os.environ.items() if name.startswith('MYSLAM_')]",
+        "{name[7:].lower(): os.environ[name] for name in os.environ if name[:7] == 'MYSLAM_'}",
+        "sorted(filter(__import__('re').compile('^MYSLAM_').match, os.environ.copy()))",
+        "[name for name in os.environb if name.startswith(b'MYSLAM_')]",
+        "any('slam_' in name.lower() for name in dict(os.environ))",
+    ],
+)
+def test_a_variable_that_is_set_later_and_looked_for_by_the_beginning_of_its_name(
+    look: str, bench: Bench
+) -> None:
+    bench.environment["ANOTHER"] = "1"
+    reads = bench.record(f"import os\ndef run():\n    return {look}\n")
+    assert "HOME" not in reads.to_json()
+    # what names the session is no input
+    bench.environment["SSH_TTY"] = "/dev/pts/7"
+    assert bench.changed(reads) == ""
+    bench.environment["MYSLAM_GAIN"] = "2"
+    assert bench.changed(reads) == "the list of environment variables"
+
+
 @pytest.mark.parametrize("look", LOOKS + LISTINGS)
 def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
     bench.environment["MY_SLAM_MODE"] = "fast"

@@ -35,7 +35,7 @@ RECORDING_FILE = "recording.rrd"
 IMAGE = "world/camera/image"
 """Where the images are in the recording."""
 LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
-"""What is drawn over the images, and where it is in the recording."""
+"""Layers drawn over the images, with their paths in the recording."""
 _JPEG_QUALITY = 80
 _STAMP_TOLERANCE_S = 1e-5
 """Poses and frames whose stamps differ by less belong to each other."""

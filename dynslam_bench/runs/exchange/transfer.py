@@ -23,8 +23,8 @@ from dynslam_bench.envs.slam_env import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint, share_of_time
 from dynslam_bench.geometry import (
     Array,
+    LoadedTrajectory,
     Trajectory,
-    TumFile,
     associate,
     nearest_gap,
     to_seconds,
@@ -305,7 +305,7 @@ class Provenance(Record):
 
 
 def stated_provenance(file: Path) -> str:
-    """What ``provenance.json`` beside a trajectory says of it; empty where there is none, or the file has changed.
+    """Provenance stated in ``provenance.json`` beside a trajectory; empty where there is none, or the file has changed.
 
     Args:
         file: The trajectory, or the folder that holds it.
@@ -551,7 +551,7 @@ def _reference_by_images(opened: Sequence) -> _Reference:
     )
 
 
-def _reference_by_truth(sequence: str, truth: TumFile) -> _Reference:
+def _reference_by_truth(sequence: str, truth: LoadedTrajectory) -> _Reference:
     """A sequence of which only the ground truth is here."""
     poses = truth.poses(repeats=True)
     part = _part_by_truth(sequence, poses)
@@ -574,7 +574,7 @@ def _part_by_truth(sequence: str, truth: Trajectory) -> SequencePart:
 
 
 def _info_by_truth(part: SequencePart, truth: Trajectory, name: str) -> SequenceInfo:
-    """What is known of a sequence without its images: the catalogue's entry and the camera's motion.
+    """Describe a sequence without its images: the catalogue's entry and the camera's motion.
 
     Args:
         part: The whole sequence.

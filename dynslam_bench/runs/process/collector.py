@@ -1,4 +1,4 @@
-"""What a run read, made of what a recorder has noted: contents of files, modules, distributions and programs."""
+"""The collection of what a run read from a recorder's notes: files, modules, distributions and programs."""
 
 import os
 import re
@@ -22,6 +22,7 @@ from dynslam_bench.core.programs import (
 )
 from dynslam_bench.core.reads import (
     ABSENT,
+    ALL_VARIABLES,
     COMMAND,
     SEARCH_PATHS,
     UNREADABLE,
@@ -34,11 +35,12 @@ from dynslam_bench.core.reads import (
     names_in,
     search_now,
     value_digest,
+    variables_now,
 )
 from dynslam_bench.runs.process.origins import Origins
 
 _LOADED_NS = time.time_ns()
-"""What the fork server has loaded is older than this: it imports this module, too."""
+"""Time when this module was loaded: modules that the fork server has loaded are older."""
 _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
@@ -86,7 +88,7 @@ _OWN_DISTRIBUTION = "dynslam-bench"
 
 
 class Stamp(NamedTuple):
-    """What tells that a file is the same as before: its place on the disk, its size and its times.
+    """State of a file that tells whether it is the same as before: its place on the disk, its size and its times.
 
     Attributes:
         device: The device.
@@ -141,8 +143,8 @@ class Notes:
         files: Each file that was opened to be read.
         folders: The names in each folder that was listed; None where it was not there.
         variables: Environment variables that were looked up.
-        has_all_variables: Whether all of them were listed: of a copy nobody announces what is looked
-            up in it.
+        has_all_variables: Whether all of them were listed: nobody announces what is looked up in a
+            copy, or which beginning of a name is looked for.
         modules: Top-level names of modules that were imported, or could not be.
         metadata: Folders with the metadata of distributions whose version was asked for.
         commands: When each command was started first, in nanoseconds since the epoch.
@@ -244,6 +246,9 @@ class Collector:
         links = {path: link_now(path, self._base_folders) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
         variables |= self._variables_in(files)
+        environment = {f"${key}": value_digest(self.environment.get(key)) for key in variables}
+        if self.notes.has_all_variables:
+            environment[ALL_VARIABLES] = variables_now(self.environment)
         asked_for = {
             name for name, folder in imports.distributions.items() if folder in self.notes.metadata
         }
@@ -254,7 +259,7 @@ class Collector:
             files={name(path): digest for path, digest in files.items()},
             folders={name(path): digest for path, digest in folders.items()},
             links={name(path): target for path, target in links.items() if target},
-            environment={f"${key}": value_digest(self.environment.get(key)) for key in variables},
+            environment=environment,
             search=self._search(),
             modules=modules.places,
             distributions={key: imports.distribution(key) for key in used_distributions},
@@ -293,7 +298,7 @@ class Collector:
         return ABSENT if note.stamp is None and content != UNREADABLE else content
 
     def _still_missing(self) -> set[str]:
-        """What was looked for and is not there at the end either: the rest was made by the run."""
+        """Paths that were looked for and are still missing at the end: the run made the others."""
         return {
             path
             for path in set(self.notes.missing)

@@ -17,6 +17,7 @@ main script and may not be used in daemonic processes, see ``docs/decisions/fork
 
 import atexit
 import contextlib
+import gc
 import importlib
 import json
 import os
@@ -65,7 +66,7 @@ PRELOADED = (
     "dynslam_bench.trackers.registry",
     "dynslam_bench.sequences.synthetic.sequence",
 )
-"""What the server imports before it forks."""
+"""Modules that the server imports before it forks."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 _CLOSE_S = 10.0
@@ -366,6 +367,8 @@ def _preload() -> None:
         # distributions read already
         importlib.import_module("dynslam_bench.runs.process.recorder")
         ImportPath(sys.path).read_all()
+    # the children's garbage collector passes over what is here: it would copy nearly all of it
+    gc.freeze()
 
 
 if __name__ == "__main__":

@@ -128,7 +128,9 @@ class ReadRecorder:
         self._watcher: threading.Thread | None = None
         # descriptor of the log of a forked process; -1 in the process that makes the run
         self._log = -1
-        # the last snapshot, with the count of reads that it is of
+        # the last record, with the reads and looks at programs that it is of
+        self._so_far: tuple[Reads, tuple[float, ...]] | None = None
+        # its digest, with the count of reads
         self._snapshot = (-1, "")
         self._handlers: dict[str, Callable[..., None]] = {
             "open": self._on_open,
@@ -195,17 +197,22 @@ class ReadRecorder:
         return self._collector.collect(modules)
 
     def so_far(self) -> Reads:
-        """The record of what was read so far; it may change until the end."""
-        with self._ignoring_own_reads():
-            return self._collector.collect(self._collector.modules())
+        """The record of what was read so far; costs nothing where nothing was read since the last call.
+
+        It may change until the end.
+        """
+        state = (self.count, *self._age_at_look.values())
+        if self._so_far is None or self._so_far[1] != state:
+            with self._ignoring_own_reads():
+                self._so_far = (self._collector.collect(self._collector.modules()), state)
+        return self._so_far[0]
 
     def snapshot(self) -> str:
-        """Digest of everything that was read so far; costs nothing where nothing was read since the last call."""
+        """Digest of everything that was read so far."""
         count, value = self._snapshot
         if count != self.count:
-            with self._ignoring_own_reads():
-                count = self.count
-                value = digest_of(self._collector.collect(self._collector.modules()))
+            count = self.count
+            value = digest_of(self.so_far())
             self._snapshot = (count, value)
         return value
 

@@ -318,7 +318,7 @@ class _Supervisor:
 
 
 def _reason_of_exit(code: int) -> str:
-    """What ended a process, by its exit code: minus the number of a signal."""
+    """Describe what ended a process, by its exit code: minus the number of a signal."""
     if code >= 0:
         return f"the process left with exit code {code}"
     name = {number.value: number.name for number in signal.Signals}.get(-code, f"signal {-code}")

@@ -80,7 +80,8 @@ class RecordedSequence:
         remarks: Phrases of that line that tell more than numbers of images and poses: files
             that were not used, a frame rate or a depth that nobody could mean.
         taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
-            unit; ground truth, and all that was not taken as it stands.
+            unit; ground truth and numbers of what was not used. `remarks` are not repeated: the
+            table of the runs has them.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -158,10 +159,9 @@ class RecordedSequence:
             "" if self.ground_truth else "no ground truth",
             contents.truth_dropped,
             turned,
-            self._doubtful_truth(),
-            *self.remarks,
         ]
-        self.dropped = "; ".join(phrase for phrase in phrases if phrase)
+        doubtful = [self._doubtful_truth(), *self.remarks]
+        self.dropped = "; ".join(phrase for phrase in (*phrases, *doubtful) if phrase)
 
         # what the folder was taken for
         unit = "depth in metres"

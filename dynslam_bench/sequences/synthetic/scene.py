@@ -1,4 +1,4 @@
-"""What a scene films: static parts, rigid bodies on paths, people, a camera, two sensors.
+"""A scene to be filmed: static parts, rigid bodies on paths, people, a camera, two sensors.
 
 `World` is the description, `Scene` its primitives at any time, `View` how the rows of one frame see
 them.

@@ -172,7 +172,7 @@ class SyntheticSequence:
         id: For example ``synthetic/walking_xyz?scene=0&frames=600``.
         whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all
             lengths cut the same script.
-        split: ``tune`` (scenes 0-99) or ``held-out`` (100-199).
+        split: ``tune`` (scenes 0-99) or ``held-out`` (all others).
         tags: How much of the scene moves.
         noise: Seed of the sensors' noise; None for the scene's own.
         timestamps: Stamps of all frames in seconds.

@@ -258,7 +258,7 @@ _CLASSES: dict[tuple[type[Settings], str], type[Settings]] = {}
 
 
 class ProgramFile(Record):
-    """What the TOML file of a program says.
+    """Content of a program's TOML file.
 
     Attributes:
         name: Shown in tables.
@@ -316,7 +316,7 @@ class ProgramFile(Record):
 
 
 class BatchProgram(ProgramFile):
-    """What the TOML file of `batch:FILE` says.
+    """Content of the TOML file of `batch:FILE`.
 
     The command has ``{sequence}`` (a folder in TUM layout), ``{camera}`` (ORB-SLAM's YAML),
     ``{associations}``, ``{output}`` and ``{folder}`` (which holds these), too.
@@ -339,7 +339,7 @@ class BatchProgram(ProgramFile):
 
 
 class ServedProgram(ProgramFile):
-    """What the TOML file of `subprocess:FILE` says: of a program that answers frame by frame.
+    """Content of the TOML file of `subprocess:FILE`, a program that answers frame by frame.
 
     Attributes:
         images: ``raw``: one memory-mapped file; ``png``: two PNG files a frame.
@@ -771,7 +771,7 @@ def read_served(path: Path) -> ProgramDocument[ServedProgram]:
 
 
 def describe_batch(value: str) -> dict[str, Any]:
-    """What the file of `batch:FILE` says, as fields of its `TrackerSpec`.
+    """Read the file of `batch:FILE` into fields of its `TrackerSpec`.
 
     Raises:
         SettingsError: It is damaged.
@@ -780,7 +780,7 @@ def describe_batch(value: str) -> dict[str, Any]:
 
 
 def describe_served(value: str) -> dict[str, Any]:
-    """What the file of `subprocess:FILE.toml` says, as fields of its `TrackerSpec`; empty for `subprocess:COMMAND`.
+    """Read the file of `subprocess:FILE.toml` into fields of its `TrackerSpec`; none for `subprocess:COMMAND`.
 
     Raises:
         SettingsError: It is damaged.

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
-from dynslam_bench.contracts.checks import faults
+from dynslam_bench.contracts.checks import as_covariance, faults
 from dynslam_bench.core import (
     SHARED_MEMORY,
     DynslamError,
@@ -314,7 +314,14 @@ def read_track_answer(
         stats = _numbers(answer, "stats")
         timings = _numbers(answer, "timings")
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
-    result = TrackResult(pose, cast(TrackingState, str(answer.get("state"))[:80]), stats, timings)
+    covariance = answer.get("motion_covariance")
+    result = TrackResult(
+        pose,
+        cast(TrackingState, str(answer.get("state"))[:80]),
+        stats,
+        timings,
+        motion_covariance=None if covariance is None else as_covariance(covariance),
+    )
     for fault in faults(result, frame):
         raise TrackerError(f"{who}: answered {fault.found}", fault.cause)
     return result
