@@ -19,6 +19,7 @@ from queue import SimpleQueue
 from typing import Any, BinaryIO, TypeVar
 
 from dynslam_bench.core import InfrastructureError
+from dynslam_bench.runs.process.jobs import THREAD_VARIABLES
 
 T = TypeVar("T")
 Call = tuple[Callable[..., Any], Sequence[tuple[Any, ...]]]
@@ -29,8 +30,6 @@ MOST_WORKERS = 8
 """Worker processes of one report at most."""
 _AT_ONCE = 40
 """Jobs that a worker takes at once."""
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Threads of numerical libraries: there is a worker a core already, and their matrices are small."""
 _PROGRAM = (
     "import sys; sys.path[:] = sys.argv[1:]; import pickle, signal; "
     "signal.signal(signal.SIGINT, signal.SIG_IGN); pickle.load(sys.stdin.buffer)()"
@@ -89,7 +88,8 @@ class WorkerPool:
 def _start_worker() -> "subprocess.Popen[bytes]":
     """Start a worker that imports modules from where the caller does."""
     command = [sys.executable, "-c", _PROGRAM, *sys.path]
-    environment = os.environ | dict.fromkeys(_THREADS, "1")
+    # a worker a core: the numerical libraries get no threads of their own
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
     worker = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
     )
