@@ -26,6 +26,7 @@ from dynslam_bench.cli.options import (
     complete_sequences,
     complete_statuses,
     complete_trackers,
+    names_of,
 )
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
@@ -263,6 +264,55 @@ def export(
 
 
 @app.command()
+def archive(
+    server: Annotated[
+        str,
+        typer.Argument(
+            help="eth3d or kitti.",
+            autocompletion=names_of("runs.exchange.server_archives:SERVERS"),
+        ),
+    ],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="The archive, a .zip.")],
+    tracker: Annotated[
+        str, typer.Option(help="Id or label of the tracker.", autocompletion=complete_trackers)
+    ],
+    online: Annotated[
+        bool, typer.Option("--online", help="The causal poses, not the final ones.")
+    ] = False,
+    results: Results = Path("results"),
+    as_json: AsJson = False,
+) -> None:
+    """Write a tracker's runs as an archive for the server of ETH3D or KITTI."""
+    from dynslam_bench.runs.exchange.server_archives import write_server_archive
+
+    which = "online" if online else None
+    written = write_server_archive(server, output, tracker, results=results, which=which)
+    lines = [f"{name}: run {run_id}" for name, run_id in sorted(written.runs.items())]
+    present(written, *lines, str(written.file))
+    for line in written.notes:
+        announce(line)
+
+
+def describe(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of a rendered sequence, a Minari data set or a bank; or a rendered id."
+        ),
+    ],
+    url: Annotated[str, typer.Option(help="Where the data set is published.")] = "",
+    creator: Annotated[str, typer.Option(help="Who publishes it.")] = "dynslam-bench contributors",
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write Croissant metadata and a data card beside a data set."""
+    from dynslam_bench.runs.exchange.dataset_metadata import describe_data
+
+    described = describe_data(source, url=url, creator=creator, data_root=data_root)
+    present(described, f"{described.kind}:", str(described.croissant), str(described.card))
+
+
+@app.command()
 def rm(
     runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,
     results: Results = Path("results"),
@@ -354,6 +404,9 @@ def reproduce(
     tracker: Annotated[
         str, typer.Option(help="Where the tracker is here, if its id does not find it.")
     ] = "",
+    sequence: Annotated[
+        str, typer.Option(help="Folder of the sequence here, if its id does not find it.")
+    ] = "",
     repeats: Annotated[
         int, typer.Option(min=1, help="Further starts, run where the result is not equal.")
     ] = 2,
@@ -372,6 +425,7 @@ def reproduce(
             row,
             by=by,
             tracker=tracker,
+            sequence=sequence,
             repeats=repeats,
             results=results,
             data_root=data_root,

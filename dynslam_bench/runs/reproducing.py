@@ -61,6 +61,7 @@ def reproduce(
     *,
     by: str,
     tracker: str = "",
+    sequence: str = "",
     repeats: int = REPEATS,
     results: str | Path = "results/reproduced",
     data_root: str | Path | None = None,
@@ -78,6 +79,7 @@ def reproduce(
         by: Who runs it, as the mark shows it.
         tracker: Where the tracker is on this machine, if its id does not find it, e.g.
             ``own.py:Attr``.
+        sequence: Where the sequence is on this machine, if its id does not find it: a folder.
         repeats: Further starts that are run here at most.
         results: Results folder for the new runs.
         data_root: Folder of the recorded sequences.
@@ -98,7 +100,7 @@ def reproduce(
     # the same run here: bits of the renderer, tracker, settings, data
     on_step("checking this machine")
     _check_bits(record, description)
-    resolved = _resolved(record, tracker, data_root)
+    resolved = _resolved(record, tracker, sequence, data_root)
     on_step(f"running {record.tracker.label} on {record.sequence.id}")
     place = RunStore(results)
     again = run_one(resolved, place, protocol=description.protocol)
@@ -184,7 +186,9 @@ def _check_bits(record: RunRecord, description: BankDescription) -> None:
         )
 
 
-def _resolved(record: RunRecord, tracker: str, data_root: str | Path | None) -> ResolvedRun:
+def _resolved(
+    record: RunRecord, tracker: str, sequence: str, data_root: str | Path | None
+) -> ResolvedRun:
     """The run of a row, looked up on this machine.
 
     Raises:
@@ -196,7 +200,7 @@ def _resolved(record: RunRecord, tracker: str, data_root: str | Path | None) -> 
     given = tracker or info.given or info.id
     spec = RunSpec(
         tracker=given,
-        sequence=record.sequence.id,
+        sequence=sequence or record.sequence.id,
         settings=record.overrides,
         frames=record.frames,
         offset=record.offset,
