@@ -19,7 +19,6 @@ _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 _PLUGIN_FILES = "plugin:"
 _ENTRY_FILES = "work:/entries/"
 """Beginnings of names of files that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
-_COMMAND_FILES = "the files that its command names"
 _VERSION = "its version"
 
 
