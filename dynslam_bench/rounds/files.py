@@ -114,12 +114,12 @@ class Round(RoundRecord):
         Raises:
             RunError: The renderer, a family or the protocol has another version.
         """
-        here = renderer_versions(self.families)
-        for part, version in self.renderer.items():
-            if here.get(part) != version:
+        for part, version in renderer_versions(self.families).items():
+            stated = self.renderer.get(part)
+            if stated != version:
                 what = "the renderer" if part == "renderer" else f"family '{part}'"
                 raise RunError(
-                    f"round {self.name} was made with version {version} of {what}, here it is {here.get(part)}",
+                    f"round {self.name} was made with version {stated} of {what}, here it is {version}",
                     "install the release of dynslam-bench that the round was made with",
                 )
         digest_here = get_protocol(self.protocol).digest()
@@ -159,7 +159,7 @@ class Program(Record):
         settings: All settings by dotted name.
         code: Digest of the code of each part, of the tracker's version and of packages that it needs.
         weights: Digests of the networks.
-        files: Digests of the entrant's own files, below the round's folder or beside the plug-in.
+        files: Digests of the entrant's own files, in ``entries/NAME`` or beside the plug-in.
     """
 
     settings: dict[str, Any]
