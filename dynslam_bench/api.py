@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation import Protocol
     from dynslam_bench.reports import ReportPaths
-    from dynslam_bench.runs import Plan, RunEvent
+    from dynslam_bench.runs import PlannedRuns, RunEvent
     from dynslam_bench.runs.many import OnFault
     from dynslam_bench.tuning import Study, StudySpec, StudySummary
 
@@ -75,7 +75,7 @@ class RunResult:
 
     @property
     def status(self) -> str:
-        """How it ended: ``ok``, ``lost``, ``crashed``, ..."""
+        """Status in which it ended: ``ok``, ``lost``, ``crashed``, ..."""
         return self.record.status
 
     @property
@@ -85,7 +85,7 @@ class RunResult:
 
     @property
     def remarks(self) -> list[str]:
-        """What to know before the metrics are believed, a line each: warnings and hints."""
+        """Warnings and hints on the metrics, one a line."""
         return self.store.score(self.record, self.protocol).remarks
 
     @property
@@ -95,7 +95,7 @@ class RunResult:
 
     @property
     def folder(self) -> Path:
-        """Where its files are."""
+        """Folder of its files."""
         return self.store.folder(self.run_id)
 
     def frames(self) -> pd.DataFrame:
@@ -218,7 +218,7 @@ def bench(
     memory_limit_mb: float | None = None,
     shard: tuple[int, int] = (1, 1),
     on_workers: Callable[[list[dict[str, object]]], None] | None = None,
-    on_plan: Callable[[Plan], None] | None = None,
+    on_plan: Callable[[PlannedRuns], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_fault: OnFault | None = None,
     **choice: Any,

@@ -40,6 +40,7 @@ class FrameOutcome:
             it) and the tracker's stages.
         error: Causal errors against the ground truth; None where there is none.
         reward: What the frame earned.
+        motion_covariance: What the tracker gave, see `TrackResult`; None where it gave none.
     """
 
     index: int
@@ -50,6 +51,7 @@ class FrameOutcome:
     timings: Mapping[str, float]
     error: OnlineSample | None
     reward: float = 0.0
+    motion_covariance: NDArray[np.float64] | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FrameOutcome:
         """Itself: nothing changes it."""
@@ -161,7 +163,7 @@ def metric_names(protocol: Protocol) -> tuple[str, ...]:
 # Rewards: what the newest frame of an episode earns.
 
 Reward = Callable[[Episode], float]
-"""What the newest frame of an episode earns, in metres."""
+"""Reward of the newest frame of an episode, in metres."""
 Cost = Literal["network_calls", "keypoints", "processor_s"]
 RewardKind = Literal["neg_rpe", "neg_pose_error", "neg_window_error", "accuracy_minus_cost"]
 
@@ -206,7 +208,7 @@ class NegWindowError:
             raise SettingsError(f"a window has {self.frames} frames", "give 1 or more")
 
     def __call__(self, episode: Episode) -> float:
-        """What the newest frame earns."""
+        """Reward of the newest frame."""
         now = episode.outcomes[-1].error
         before = episode.outcomes[-1 - self.frames :][0].error
         if now is None or before is None:
@@ -247,7 +249,7 @@ class AccuracyMinusCost:
             )
 
     def __call__(self, episode: Episode) -> float:
-        """What the newest frame earns."""
+        """Reward of the newest frame."""
         return neg_rpe(episode) - self.charge(episode.outcomes[-1])
 
     def charge(self, outcome: FrameOutcome) -> float:

@@ -324,7 +324,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What an adapter of this package measured of its program, and its ``notes``; empty for other trackers."""
+        """Measurements of its program and ``notes`` by an adapter of this package; empty for other trackers."""
         if not self.tracker_spec.entry_point.startswith("dynslam_bench."):
             return {}
         return dict(getattr(self._tracker, "measured", {}))
@@ -744,7 +744,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
         outcome = FrameOutcome(
-            index, frame.timestamp, result.state, pose, result.stats, timings, error
+            index,
+            frame.timestamp,
+            result.state,
+            pose,
+            result.stats,
+            timings,
+            error,
+            motion_covariance=None if pose is None else result.motion_covariance,
         )
         self._add_with_reward(self.episode, outcome)
 

@@ -140,6 +140,7 @@ class ActionMap:
 
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
     """The parameters of the settings that actions change, in the order of `control`; see `ActionMap`."""
+    # a list of names of online settings
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
     online = {
@@ -153,6 +154,7 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
                 fault = f"setting '{name}' may not change in mid-episode"
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(fault, hint)
+        # once each, with an effect, and with a finite range for the actions
         parameter = online[name]
         if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
@@ -273,7 +275,7 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
 """Name and meaning of every entry of the ``stats`` observation, in order. What a tracker does not report is 0."""
 
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
-"""Which entries of ``stats`` may be negative, bool ``[24]``."""
+"""Flags ``[24]`` of the entries of ``stats`` that may be negative."""
 
 
 def stats_space() -> spaces.Box:

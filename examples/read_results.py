@@ -1,4 +1,4 @@
-"""What was stored, as pandas frames, and two figures of it.
+"""Stored runs as pandas frames, and two figures of them.
 
 dynslam-bench run orb-slam2 'synthetic/walking_xyz?scene=100' --frames 0:60        # or any other
 runs python examples/read_results.py [RESULTS] [FOLDER FOR THE FIGURES]

@@ -14,7 +14,7 @@ from dynslam_bench.tuning import Outcome, ProblemInstance, Study
 
 
 def error_and_time(run: Outcome) -> float:
-    """What a run costs: a number above 0, compared with the default's on the same instance; less is better."""
+    """Cost of a run: a number above 0, compared with the default's on the same instance; less is better."""
     return run.ate_m * run.processor_s**0.1
 
 

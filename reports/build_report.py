@@ -320,7 +320,7 @@ def _monocular_boards(loaded: LoadedRuns, boards: Mapping[str, Board]) -> dict[s
 
 
 def pages_for(runs: int, typical: int) -> int:
-    """How many pages a report has where nobody asks for another number: of very many runs most are never opened.
+    """Pages of a report where nobody asks for another number: of very many runs most are never opened.
 
     Args:
         runs: Runs of the report.
@@ -358,7 +358,7 @@ def _choose_paged(board: Board, typical: set[str], most: int | None) -> list[Run
 
 
 def _pageless_note(pages: int, runs: int) -> str:
-    """Which runs have no page, in words; empty if all have one."""
+    """Sentence on the runs that have no page; empty if all have one."""
     if pages == runs:
         return ""
     return (
@@ -526,7 +526,7 @@ def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
 
 
 def _speed_caption(content: _Content) -> str:
-    """How to read the figure of accuracy against speed."""
+    """Sentences on reading the figure of accuracy against speed."""
     board = content.board
     sentences = []
     if len(content.boards) > 1:
@@ -560,7 +560,7 @@ def _page_of_sections(content: _Content, page: str, footer: str) -> str:
 
 
 def how_to_read(board: Board) -> str:
-    """What the ranking says, for a reader without statistics."""
+    """Explain the ranking to a reader without statistics."""
     return " ".join(filter(None, [explanation(board), mean_rank_note(board)]))
 
 
@@ -576,7 +576,7 @@ def sections_page(sections: Sequence[Section], **values: Any) -> str:
 
 
 def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
-    """What the board is made of: sequences, trackers, runs, failures, reservations and the protocol."""
+    """Facts of the board: sequences, trackers, runs, failures, reservations and the protocol."""
     # sequences by group
     names = [*board.sequences, *board.unscored]
     by_group = grouped(names, lambda name: board.groups[name])
@@ -624,7 +624,7 @@ _MOST_COMMANDS = 200
 
 
 def _board_notes(board: Board, loaded: LoadedRuns) -> list[str]:
-    """What a reader has to know about the ranking of a category: gaps, and what is not ranked."""
+    """Notes on the ranking of a category: gaps, and what is not ranked."""
     notes = [missing_note(board), copies_note(board)]
     if board.final_only:
         final_only = ", ".join(board.labels[key] for key in board.final_only)
@@ -640,7 +640,7 @@ def _board_notes(board: Board, loaded: LoadedRuns) -> list[str]:
 
 
 def _common_notes(protocol: Protocol, loaded: LoadedRuns, pageless: str) -> list[str]:
-    """What a reader has to know about all categories: contradictions, and what is left out."""
+    """Notes on all categories: contradictions, and what is left out."""
     notes = []
     if loaded.conflicts:
         conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
@@ -662,7 +662,7 @@ def _common_notes(protocol: Protocol, loaded: LoadedRuns, pageless: str) -> list
 
 
 def _left_out_note(loaded: LoadedRuns) -> str:
-    """How many runs are in no table, by reason; empty for none."""
+    """Sentence on runs that are in no table, by reason; empty for none."""
     left_out = {
         "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
         "runs that were stopped on request": loaded.stopped,
@@ -673,7 +673,7 @@ def _left_out_note(loaded: LoadedRuns) -> str:
 
 
 def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
-    """What is to be said where several programs made runs of one tracker."""
+    """Notes where several programs made runs of one tracker."""
     notes = []
     others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
     if others:
@@ -884,9 +884,9 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
 STUDY_PAGE = "index.html"
 """The page of a study's folder."""
 README = "README.md"
-"""What hosts of repositories show of a folder: they show the source of HTML."""
+"""File that hosts of repositories show of a folder: of HTML they show the source."""
 _PUBLISHED = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
-"""What of a study's folder is published; its runs and its journal are not."""
+"""Files of a study's folder that are published; its runs and its journal are not."""
 _LISTS_OF_FILES = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
 """The lists of pictures and files in what the page of a run shows; entries may be lists themselves."""
 

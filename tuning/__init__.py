@@ -9,11 +9,11 @@ judges the best of them on held-out instances, `write_page` shows it all. `searc
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dynslam_bench.evaluation.verdicts import Verdict
+    from dynslam_bench.evaluation.verdicts import ComparisonVerdict
     from dynslam_bench.tuning.judgement import StudySummary, finish, read_preset_text
     from dynslam_bench.tuning.objectives import Outcome
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.plan import Plan, Preview
+    from dynslam_bench.tuning.plan import Preview, StudyPlan
     from dynslam_bench.tuning.space import distributions, search_space
     from dynslam_bench.tuning.study import Evaluation, Study, StudyEvent, run_study
     from dynslam_bench.tuning.study_file import (
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
         read_study,
     )
 
-_HOMES = {
+_DEFINED_IN = {
     "Evaluation": "study",
     "Outcome": "objectives",
-    "Plan": "plan",
+    "StudyPlan": "plan",
     "Preview": "plan",
     "ProblemInstance": "study_file",
     "SpaceSpec": "study_file",
@@ -35,7 +35,7 @@ _HOMES = {
     "StudyEvent": "study",
     "StudySpec": "study_file",
     "StudySummary": "judgement",
-    "Verdict": "judgement",
+    "ComparisonVerdict": "judgement",
     "distributions": "space",
     "finish": "judgement",
     "parse_instances": "study_file",
@@ -47,17 +47,17 @@ _HOMES = {
 }
 
 __all__ = [
+    "ComparisonVerdict",
     "Evaluation",
     "Outcome",
-    "Plan",
     "Preview",
     "ProblemInstance",
     "SpaceSpec",
     "Study",
     "StudyEvent",
+    "StudyPlan",
     "StudySpec",
     "StudySummary",
-    "Verdict",
     "distributions",
     "finish",
     "parse_instances",
@@ -71,8 +71,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for; Optuna takes its time."""
-    if name not in _HOMES:
+    if name not in _DEFINED_IN:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_DEFINED_IN[name]}"), name)

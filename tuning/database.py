@@ -24,7 +24,7 @@ MAX_RETRY_S = 60.0
 """For so long a database that does not answer is asked again."""
 _OPEN_ATTEMPTS = 10
 _BEING_CREATED = ("already exists", "duplicate", "unique constraint", "is locked")
-"""What drivers say where another worker creates the tables at the same time."""
+"""Messages of drivers where another worker creates the tables at the same time."""
 _NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
 """Errors of a database that is away; the last one where it went within a transaction."""
 

@@ -19,8 +19,8 @@ from dynslam_bench.evaluation.verdicts import (
     FEWEST,
     LOOKS,
     ONE_SIDED,
+    ComparisonVerdict,
     PairedRatio,
-    Verdict,
     findings,
     paired_ratio,
     scenes_to_settle,
@@ -61,7 +61,7 @@ from dynslam_bench.tuning.study_file import TRACKER, ProblemInstance, StudySpec,
 
 NOT_JUDGED = "not judged"
 """Status of settings that no scenes have judged."""
-OFFERED = (Verdict.PROVEN, Verdict.BUT_LOST, Verdict.PROMISING)
+OFFERED = (ComparisonVerdict.PROVEN, ComparisonVerdict.BUT_LOST, ComparisonVerdict.PROMISING)
 """Verdicts with which `best.toml` sets the best trial's settings; with others it keeps the baseline's."""
 
 
@@ -129,7 +129,7 @@ class Candidate(Record):
 
     @property
     def evidence(self) -> PairedRatio | None:
-        """Its ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
+        """Ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
         return self.confirm if self.held_out is None else self.held_out
 
     @property
@@ -189,7 +189,7 @@ class StudySummary(Record):
     protocol: str
     trials: dict[str, int]
     candidates: list[Candidate]
-    verdict: Verdict
+    verdict: ComparisonVerdict
     conclusion: str
     shipped: dict[str, PairedRatio] = Field(default_factory=dict)
     importances: dict[str, Importance] = Field(default_factory=dict)
@@ -214,7 +214,7 @@ class StudySummary(Record):
     @property
     def is_to_use(self) -> bool:
         """Whether the best trial's settings are a result to use."""
-        return self.verdict is Verdict.PROVEN and not self.keeps_default
+        return self.verdict is ComparisonVerdict.PROVEN and not self.keeps_default
 
     @property
     def offered(self) -> dict[str, Any]:
@@ -235,7 +235,7 @@ def _is_as_good(default: PairedRatio | None, best: PairedRatio | None) -> bool:
 # The verdict on the best candidate, and the sentences that say it.
 
 
-def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
+def judge(best: Candidate | None) -> tuple[ComparisonVerdict, list[str]]:
     """The verdict on the best candidate, and short sentences with its numbers, without their full stops.
 
     `evaluation.verdicts.verdict_of` decides on the judging scenes. Beside that a candidate that violates
@@ -243,14 +243,16 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
     else, is not *proven*.
     """
     if best is None:
-        return Verdict.CANNOT_TELL, ["no trial with other settings came to its end"]
+        return ComparisonVerdict.CANNOT_TELL, ["no trial with other settings came to its end"]
     name = f"trial {best.trial}"
     if best.failed:
-        return Verdict.CANNOT_TELL, [f"{name} failed when it was run again: {best.failed}"]
+        return ComparisonVerdict.CANNOT_TELL, [
+            f"{name} failed when it was run again: {best.failed}"
+        ]
     evidence = best.evidence
     if evidence is None:
         no_frames = f"no frames are left to judge {name} on; name some as held_out"
-        return Verdict.CANNOT_TELL, [no_frames]
+        return ComparisonVerdict.CANNOT_TELL, [no_frames]
     verdict = verdict_of(evidence)
     sentences = findings(evidence, name)
     if best.crashes:
@@ -258,7 +260,7 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         sentences.append(f"{count} crashed and counts as lost, the first one as {best.crashes[0]}")
     if not best.feasible:
         if verdict in OFFERED:
-            verdict = Verdict.CANNOT_TELL
+            verdict = ComparisonVerdict.CANNOT_TELL
         return verdict, [f"{name} violates a constraint when it is run again", *sentences]
     if verdict in OFFERED and not best.as_accurate:
         accuracy = (best.on_held_out or best.on_confirm).get("accuracy")
@@ -266,8 +268,8 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         sentences.append(
             f"It is not shown to be as accurate: {accuracy}, whose upper end has to lie below {limit:.2f}"
         )
-        is_worse = accuracy is None or verdict_of(accuracy) is Verdict.WORSE
-        verdict = Verdict.CANNOT_TELL if is_worse else Verdict.PROMISING
+        is_worse = accuracy is None or verdict_of(accuracy) is ComparisonVerdict.WORSE
+        verdict = ComparisonVerdict.CANNOT_TELL if is_worse else ComparisonVerdict.PROMISING
     if best.recorded is not None:
         sentences += findings(best.recorded, f"{name} on recordings")
     return verdict, sentences
@@ -282,7 +284,7 @@ def conclude(
     failures: Sequence[str] = (),
     families: str = "",
     inert: int = 0,
-) -> tuple[Verdict, str]:
+) -> tuple[ComparisonVerdict, str]:
     """The verdict of a study and its conclusion: a few short sentences.
 
     Args:
@@ -295,8 +297,9 @@ def conclude(
         inert: See `without_effect`.
     """
     if inert:
-        return Verdict.NO_DIFFERENCE, (
-            f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
+        verdict = ComparisonVerdict.NO_DIFFERENCE
+        return verdict, (
+            f"{verdict.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
             f"with other settings have the baseline's trajectories to the last bit. Does the tracker read its settings?"
         )
     best = candidates[0] if candidates else None
@@ -316,13 +319,15 @@ def conclude(
             )
 
     # where nothing is claimed: what the trials exclude, and what would settle it
-    if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
+    if verdict not in (ComparisonVerdict.PROVEN, ComparisonVerdict.BUT_LOST) and (
+        bound := improvement_bound(trials)
+    ):
         gain, n_trials = bound
         sentences.append(
             f"On the scenes that trials ran on none of the {n_trials} trials with {FEWEST} or more is better by "
             f"more than {math.ceil(100 * gain)} % (95 %)"
         )
-    if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:
+    if verdict in (ComparisonVerdict.PROMISING, ComparisonVerdict.CANNOT_TELL) and best is not None:
         sentences += _settling(spec, best)
 
     # beside another baseline, what the default settings reach
@@ -341,7 +346,7 @@ _TOO_MANY = 1000
 
 
 def _settling(spec: StudySpec, best: Candidate) -> list[str]:
-    """How many scenes would settle it, the command, and how long that runs; empty where nobody can tell."""
+    """Number of scenes that would settle it, the command, and how long that runs; empty where nobody can tell."""
     evidence = best.evidence
     if evidence is None or best.failed or not best.feasible:
         return []
@@ -368,7 +373,7 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
 
 
 def _further_scenes(spec: StudySpec, best: Candidate) -> int:
-    """How many scenes the next look of an extendable study adds; 0 where no look would settle it."""
+    """Number of scenes that the next look of an extendable study adds; 0 where no look would settle it."""
     evidence = best.evidence
     needed = None if evidence is None else scenes_to_settle(evidence)
     if evidence is None or needed is None or needed > max(LOOKS) or not spec.extendable:
@@ -385,7 +390,7 @@ def _extend_command(scenes_more: int) -> str:
 def next_step(
     spec: StudySpec, summary: StudySummary, baseline: Configuration, best: Configuration
 ) -> tuple[str, str]:
-    """What to do after a study: a sentence, and the command that does it.
+    """The next step after a study: a sentence, and the command that does it.
 
     Args:
         spec: The study.
@@ -403,13 +408,17 @@ def next_step(
         return f"Use the settings of trial {candidate.trial}.", run_best
 
     evidence = None if candidate is None else candidate.evidence
-    if summary.verdict is Verdict.BUT_LOST and candidate is not None and evidence is not None:
+    if (
+        summary.verdict is ComparisonVerdict.BUT_LOST
+        and candidate is not None
+        and evidence is not None
+    ):
         scene = shlex.quote(evidence.losses[0]) if evidence.losses else "SEQUENCE"
         return (
             f"See where trial {candidate.trial} fails before you use it.",
             f"dynslam-bench run {shlex.quote(best.tracker)} {scene} --settings best.toml --snapshots",
         )
-    if summary.verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL):
+    if summary.verdict in (ComparisonVerdict.PROMISING, ComparisonVerdict.CANNOT_TELL):
         is_usable = candidate is not None and not candidate.failed and candidate.feasible
         step = _further_scenes(spec, candidate) if candidate is not None and is_usable else 0
         if step:
@@ -441,7 +450,7 @@ def families_sentence(design: Design) -> str:
 def beyond_families(
     comparison: PairedRatio, ratios: Mapping[str, float], design: Design
 ) -> PairedRatio | None:
-    """What the judging families that no trial saw say of others: each counts once, by the mean of its scenes.
+    """Comparison by the judging families that no trial saw: each counts once, by the mean of its scenes.
 
     Scenes that a side lost take no part in the means; a family of which one side alone lost half of the scenes or
     more is lost by it.
@@ -598,7 +607,7 @@ def _best_trials(tuner: Study) -> list[Candidate]:
 
 
 def without_effect(tuner: Study) -> int:
-    """How many trials had other settings than trial 0, where all of them gave its trajectories to the last bit.
+    """Number of trials with other settings than trial 0, where all of them gave its trajectories to the last bit.
 
     Such settings change nothing: a program may ignore them. 0 where a trial gave another trajectory,
     or there is none to compare.

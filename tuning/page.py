@@ -11,8 +11,9 @@ import plotly.graph_objects as go
 from optuna.trial import TrialState
 
 from dynslam_bench.core import read_text, setting_text, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.settings import Parameter, Scalar
-from dynslam_bench.evaluation.verdicts import PairedRatio, Verdict
+from dynslam_bench.evaluation.verdicts import ComparisonVerdict, PairedRatio
 from dynslam_bench.reports.build_report import sections_page
 from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL, log_axis, mm_axis, rounded, safe
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
@@ -24,7 +25,6 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     csv_text,
-    mm,
     number,
     numbers,
 )
@@ -40,7 +40,7 @@ from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, front_trials, i
 from dynslam_bench.tuning.study import Study
 from dynslam_bench.tuning.study_file import scenes
 
-_LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
+_LEVELS = {ComparisonVerdict.PROVEN: "green", ComparisonVerdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
 _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
@@ -63,7 +63,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     candidates = _candidates(summary)
     trials = _trials(tuner, summary)
     params = summary.best.params if summary.best else {}
-    proven = summary.verdict == Verdict.PROVEN
+    proven = summary.verdict == ComparisonVerdict.PROVEN
     settings = settings_table(tuner.space, tuner.base, params, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", csv_text(table.frame()))
@@ -431,7 +431,7 @@ def _judged_trace(
     above = []
     below = []
     for candidate, ratio in judged:
-        is_proven = candidate is summary.best and summary.verdict is Verdict.PROVEN
+        is_proven = candidate is summary.best and summary.verdict is ComparisonVerdict.PROVEN
         symbols.append("star" if is_proven else "circle")
         centre = ratio.ratio or 0.0
         above.append(0.0 if ratio.high is None else ratio.high - centre)
@@ -460,7 +460,7 @@ def fewer_starts(design: Design) -> str:
 
 
 def warnings_of(tuner: Study) -> list[str]:
-    """What a reader of the course should know, in sentences."""
+    """Warnings on the course of a study, in sentences."""
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     infeasible = sum(not is_feasible(trial) for trial in complete)
     notes = []
@@ -483,6 +483,7 @@ def _candidates(summary: StudySummary) -> Table:
     """The table of the best trials, as they were judged again on the splits."""
 
     def ratio(value: PairedRatio | None) -> TableCell:
+        """A cell with a ratio, its interval and the number of scenes."""
         if value is None or value.ratio is None:
             return TableCell()
         scenes_text = f"{value.scenes} of {value.all_scenes}"
@@ -491,6 +492,7 @@ def _candidates(summary: StudySummary) -> Table:
         )
 
     def losses(candidate: Candidate) -> TableCell:
+        """A cell with the scenes lost by the candidate and by the baseline."""
         evidence = candidate.evidence
         if evidence is None:
             return TableCell()

@@ -101,7 +101,7 @@ def _with_source(settings: Settings, sequences: Iterable[str]) -> Settings:
 
 
 def held_settings(spec: StudySpec) -> dict[str, Any]:
-    """What every trial has beside the tuned settings: the baseline's, where that is a preset, and the fixed ones."""
+    """Settings of every trial beside the tuned ones: those of a preset as baseline, and the fixed ones."""
     preset = read_settings(Path(spec.baseline)) if spec.baseline.endswith(".toml") else {}
     return {**preset, **spec.space.fixed}
 
@@ -147,7 +147,7 @@ class Preview(Record):
 
     @property
     def figures(self) -> list[str]:
-        """What the scenes could show and how long it takes, for people."""
+        """Sentences on what the scenes could show and how long the study takes."""
         source = "the usual one"
         if self.spread > USUAL_SPREAD:
             source = f"from {self.runs} stored runs of the baseline"
@@ -191,7 +191,7 @@ class Preview(Record):
         return lines
 
 
-class Plan:
+class StudyPlan:
     """A study resolved before it runs: trackers, baseline, search space, instances.
 
     Nothing runs, and nothing is stored.
@@ -273,7 +273,7 @@ class Plan:
         self.design = design_of(spec)
 
     def preview(self, jobs: int = 1) -> Preview:
-        """What the study could show, from the baseline's stored runs where there are some."""
+        """Estimate what the study could show, from the baseline's stored runs where there are some."""
         design = self.design
         stored = {instance: self._stored(instance) for instance in design.reference}
         records = {instance: record for instance, record in stored.items() if record is not None}
@@ -317,7 +317,7 @@ class Plan:
         return tried + chosen + judged
 
     def violations(self, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
-        """How far each constraint is violated, see `objectives.violations`."""
+        """Violation of each constraint, see `objectives.violations`."""
         return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
@@ -652,8 +652,9 @@ def _misplaced(name: str, used_as: str, other_split: str) -> str:
     """The fault of a sequence that is used in one split and belongs to the other."""
     reason = "the catalogue"
     if name.startswith("synthetic/"):
-        numbers = HELD_OUT_SCENES if other_split == "held-out" else TUNE_SCENES
-        reason = f"its scene ({numbers.start}-{numbers.stop - 1})"
+        held_out = f"{HELD_OUT_SCENES.start} and above"
+        tuning = f"{TUNE_SCENES.start}-{TUNE_SCENES.stop - 1}"
+        reason = f"its scene ({held_out if other_split == 'held-out' else tuning})"
     return f"'{name}' is used as {used_as}, but {reason} puts it into the {other_split} split"
 
 
@@ -745,7 +746,7 @@ def _same_image(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
 
 
 def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
-    """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
+    """Source of a system's masks; the embedded network for ``auto`` where everything is rendered.
 
     Args:
         settings: Settings of the system.
@@ -771,7 +772,7 @@ def splits_seen(settings: Settings, design: Design) -> list[str]:
 
 
 def seen_note(splits: Sequence[str]) -> str:
-    """What such splits mean for a study, in one sentence; empty without any."""
+    """Sentence on splits that the masks' network has seen in training; empty without any."""
     if not splits:
         return ""
     names = {"tune": "trials", "confirm": "choice", "held_out": "held-out instances"}

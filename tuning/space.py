@@ -1,4 +1,4 @@
-"""What a study searches: settings with their ranges and choices, the tracker among them, and when each one counts.
+"""Search space of a study: settings with their ranges and choices, the tracker among them, and when each one counts.
 
 A setting is proposed only where it has an effect: where the chosen tracker has it, where its group is
 enabled, where the other values chosen do not switch it off (`core.settings.why_unused`), and where the
@@ -129,6 +129,7 @@ class SearchSpace:
         """The tracker first, then switches of whole groups, other choices, and numbers; each behind its conditions."""
 
         def rank(parameter: Parameter) -> int:
+            """Position of a parameter's kind: tracker, switch of a group, other choice, number."""
             if parameter.name == TRACKER:
                 return 0
             if parameter.name.endswith(".enabled"):
@@ -311,7 +312,7 @@ def _check_value(parameter: Parameter, value: Scalar, settings: Settings, what: 
 
 
 def _merged(one: Parameter, other: Parameter) -> Parameter:
-    """What two trackers that have a setting of the same name both take.
+    """Merge a setting that two trackers share into one with the values that both take.
 
     Raises:
         StudyError: They share no values.

@@ -39,7 +39,7 @@ _OPTIONS = {
     "degrade": _STRENGTHS,
     "noise": "[0-9]{1,9}",
 }
-"""What may stand behind the question mark, and how its value is written."""
+"""Options behind the question mark of an id, and how their values are written."""
 _FORM = (
     'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
 )
@@ -200,9 +200,10 @@ def _rendered_names(name: str, options: dict[str, str], text: str) -> list[str]:
 
 
 def scene_of(name: str) -> str:
-    """What a sequence's name stands for, as far as the name alone tells (see `plan.check_splits` for the content).
+    """Scene that a sequence's name stands for, as far as the name alone tells.
 
-    The frames that are taken of a sequence, and the draw of its noise, make no other scene.
+    `plan.check_splits` looks at the content. The frames that are taken of a sequence, and the draw
+    of its noise, make no other scene.
     """
     if name.startswith("synthetic/"):
         try:
@@ -355,6 +356,7 @@ class Range(Record, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _from_ends(cls, given: Any) -> Any:
+        """Take a range that is written as ``[low, high]``."""
         if isinstance(given, list | tuple):
             if len(given) != 2:
                 raise ValueError("write a range as [low, high]")
@@ -363,6 +365,7 @@ class Range(Record, frozen=True):
 
     @model_validator(mode="after")
     def _check_ends(self) -> "Range":
+        """Refuse a range that ends below its beginning, or has both a log scale and a step."""
         if self.low >= self.high:
             raise ValueError(f"the range ends at {self.high:g}, below its beginning {self.low:g}")
         if self.scale == "log" and self.step:
@@ -371,7 +374,7 @@ class Range(Record, frozen=True):
 
 
 class SpaceSpec(Record, frozen=True):
-    """Which settings are tuned, in which ranges, and when.
+    """Settings that are tuned, their ranges, and when.
 
     From Python it may also be a plain mapping of names to `optuna.distributions`.
 
@@ -400,6 +403,7 @@ class SpaceSpec(Record, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _read(cls, given: Any) -> Any:
+        """Bring the ways in which a space may be written into one: nested tables, and Optuna's distributions."""
         if not isinstance(given, dict):
             return given
         values = dict(given)

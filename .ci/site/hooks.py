@@ -1,4 +1,4 @@
-"""What MkDocs calls while it builds the site: pages that the repository holds elsewhere, or that the code itself is."""
+"""Hooks of MkDocs for the site: pages that the repository holds elsewhere, or that the code itself is."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _outside_of_fences(pattern: re.Pattern[str], change, text: str) -> str:
 
 
 def _target(page: str, link: str) -> Path | None:
-    """What a page's link means, as a path from the repository's root; None outside of it."""
+    """Target of a page's link as a path from the repository's root; None outside of it."""
     folder = Path(ELSEWHERE[page]).parent if page in ELSEWHERE else Path("docs") / Path(page).parent
     path = (ROOT / folder / link).resolve()
     return path.relative_to(ROOT) if path.is_relative_to(ROOT) else None

@@ -8,7 +8,7 @@ from types import FrameType
 
 __all__ = ["interrupted", "leave_interrupted", "main"]
 
-RESUMABLE = ("run", "bench", "tune", "demo", "report", "segmenter", "sequences")
+RESUMABLE = ("run", "bench", "round", "tune", "demo", "report", "segmenter", "sequences")
 """Verbs that keep finished work when they are interrupted."""
 
 # Signals that ask a process to end: Ctrl-C, `kill`, and a terminal that is closed.

@@ -14,6 +14,7 @@ from dynslam_bench.cli import (
     interrupted,
     leave_interrupted,
     reports,
+    rounds,
     running,
     runs,
     segmenters,
@@ -60,13 +61,15 @@ app.command("eval", rich_help_panel=MEASURE)(trajectories.evaluate)
 app.add_typer(trajectories.protocols, name="protocols", rich_help_panel=MEASURE)
 app.command("import", rich_help_panel=MEASURE)(trajectories.import_)
 app.command(rich_help_panel=MEASURE)(trajectories.export)
+app.command(rich_help_panel=MEASURE)(runs.describe)
 app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.command(rich_help_panel=REPORT)(reports.published)
 app.add_typer(gates.app, name="gate", rich_help_panel=REPORT)
+app.add_typer(rounds.app, name="round", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 cache = typer.Typer(
-    help="What is kept to be computed once: stages of the pipeline, compiled kernels, rendered frames.",
+    help="What is computed once and kept: stages, compiled kernels, rendered frames.",
     no_args_is_help=True,
 )
 app.add_typer(cache, name="cache", rich_help_panel=CARE)

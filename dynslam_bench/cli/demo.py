@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import subprocess
-import time
+import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,11 +13,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynslam_bench.cli.options import Jobs, Results
-from dynslam_bench.cli.output import SOME_RUNS_FAILED, note, progress, report_table, wrapped, write
+from dynslam_bench.cli.output import (
+    SOME_RUNS_FAILED,
+    announce,
+    note,
+    progress,
+    report_table,
+    wrapped,
+    write,
+)
 from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
 from dynslam_bench.core import find_data_root, write_atomic
 from dynslam_bench.core.folders import kernel_files
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.plugins import python_command
 
 if TYPE_CHECKING:
@@ -33,8 +42,10 @@ UNDILATED = (
     "# masks that are not grown: wrong on purpose\n[settings]\nsegmentation.dilation_px = 0\n"
 )
 """The baseline of the study: features at the edges of people stay, so there is something to find."""
-TUNED = ("segmentation.dilation_px", "segmentation.confidence", "segmentation.mask_threshold")
-"""The settings of the study."""
+TUNED = ("segmentation.dilation_px",)
+"""The setting of the study."""
+MASKS = "oracle-classes"
+"""The masks of the study: exact ones, so that no network runs on its 240 frames."""
 STUDY_SHARE = 0.5
 """Frames of a problem instance of the study, as a share of the runs' frames."""
 MIN_STUDY_FRAMES = 20
@@ -47,8 +58,8 @@ MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
 COMPILED = "emfoa-oft?masks=none"
 """The tracker whose kernels are compiled ahead: it uses those of all others, too."""
-POLL_S = 0.5
-"""How often is looked whether all kernels are compiled."""
+BAR_S = 1.0
+"""The bar of the compilation moves this often."""
 KERNEL_FRAMES = 12
 """Frames in which every kernel is used once: keyframes, bundle adjustment, all phases of the flow."""
 
@@ -57,7 +68,7 @@ def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 60,
     jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 5,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
     from functools import partial
@@ -89,7 +100,7 @@ def demo(
     )
 
     note("making the report")
-    paths = report(store.root, title="Demo: walking and sitting people, rendered")
+    paths = report(store.root, title="Demo: walking people and a balloon, rendered")
 
     tuned = tune_small_study(study, store.root / "study", jobs)
     show_outcome(store, paths, tuned)
@@ -162,7 +173,7 @@ def study_spec(frames: int, trials: int, baseline: Path) -> StudySpec:
         held_out=(f"synthetic/walking_xyz?scene=101-106&frames={frames}",),
         recorded=(),
         objectives=("accuracy",),
-        space=SpaceSpec(include=TUNED, fixed={"segmentation.source": "embedded"}),
+        space=SpaceSpec(include=TUNED, fixed={"segmentation.source": MASKS}),
         offsets=(0,),
         trials=trials,
         top=1,
@@ -180,7 +191,7 @@ def render(sequences: set[str]) -> None:
 
 
 def culling_effect(rows: Iterable[RunRow]) -> list[str]:
-    """What the runs show: a sentence on the effect of culling for each sequence, and the weight of single runs."""
+    """Sentences on the effect of culling, one a sequence, and on the weight of single runs."""
     # errors in metres by sequence and tracker; a name is `walking_xyz?scene=1`, without the frames
     errors: dict[str, dict[str, float]] = defaultdict(dict)
     for row in rows:
@@ -201,10 +212,10 @@ def culling_effect(rows: Iterable[RunRow]) -> list[str]:
         elif factor <= 1 / MIN_FACTOR:
             verdict = f"Culling makes the error {1 / factor:.1f} times larger."
         shown = [
-            f"{1e3 * error:.1f} mm with {CULLING[tracker]} ({tracker})"
+            f"{mm(error)} mm with {CULLING[tracker]} ({tracker})"
             for tracker, error in culled.items()
         ]
-        without = f"{1e3 * by_tracker[STATIC]:.1f} mm without culling ({STATIC})"
+        without = f"{mm(by_tracker[STATIC])} mm without culling ({STATIC})"
         lines.append(f"{name}: {without}, {', '.join(shown)}. {verdict}")
     return [
         *lines,
@@ -212,13 +223,19 @@ def culling_effect(rows: Iterable[RunRow]) -> list[str]:
     ]
 
 
-def compile_kernels(tracker: str = COMPILED) -> None:
-    """Use all kernels of rendering and a tracker once: then they lie compiled in the user's cache."""
+def compile_kernels(tracker: str = COMPILED, *, rendering: bool = True) -> None:
+    """Use all kernels of a tracker once: then they lie compiled in the user's cache.
+
+    Args:
+        tracker: Its id.
+        rendering: Whether those of the renderer are used, too.
+    """
     from dynslam_bench.envs.slam_env import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.testing import CornerSequence
 
-    open_synthetic("synthetic/walking_xyz?frames=2", None)[0]
+    if rendering:
+        open_synthetic("synthetic/walking_xyz?frames=2", None)[0]
     env = SlamEnv(CornerSequence(KERNEL_FRAMES), tracker)
     env.reset(seed=0)
     for _ in range(KERNEL_FRAMES - 1):
@@ -227,19 +244,36 @@ def compile_kernels(tracker: str = COMPILED) -> None:
 
 @contextmanager
 def compiled_ahead() -> Iterator[None]:
-    """Compile the kernels in a process while the body runs; stop it if the body fails.
+    """Compile the trackers' kernels in a process while the body renders; stop it if the body fails.
 
     Two runs at a time would otherwise compile the same kernels twice. Kernels that cannot be
-    compiled here are left to the first runs, which report it.
+    compiled here are left to the first runs; a line says so.
     """
-    command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    command = python_command(
+        f"from {__name__} import compile_kernels; compile_kernels(rendering=False)"
+    )
+    with (
+        tempfile.TemporaryFile("w+", errors="replace") as log,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log) as process,
+    ):
         before = set(kernel_files())
         try:
             yield
             with progress("compiling kernels, once") as advance:
-                while process.poll() is None:
+                while not _has_ended(process):
                     advance(len(set(kernel_files()) - before), None)
-                    time.sleep(POLL_S)
         finally:
             process.kill()
+        if process.returncode:
+            log.seek(0)
+            last = log.read().strip().splitlines()[-1:] or [f"exit code {process.returncode}"]
+            announce(f"kernels were not compiled ahead, so the first runs do it: {last[0]}")
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Wait for a process, for `BAR_S` at most; returns whether it has ended."""
+    try:
+        process.wait(BAR_S)
+    except subprocess.TimeoutExpired:
+        return False
+    return True

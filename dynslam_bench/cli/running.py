@@ -303,7 +303,7 @@ def bench(
     help_all: opts.HelpAll = False,
     as_json: opts.AsJson = False,
 ) -> None:
-    """Run a suite: every tracker on every sequence with every seed; a second call continues an interrupted one."""
+    """Run a suite: every tracker on every sequence with every seed; called again it goes on."""
     from dynslam_bench.api import bench as run_suite
     from dynslam_bench.sequences.catalogue import parse_frames
 
@@ -456,7 +456,7 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
 
 
 COMPILED_S = 1.0
-"""How often is looked for compiled kernels."""
+"""Interval between two looks for compiled kernels, seconds."""
 
 
 class WatchedRuns:
@@ -488,7 +488,7 @@ class WatchedRuns:
         self.reused: set[str] = set()
         self.faults: set[str] = set()
         # frames of all runs that are made, of those that have ended, and of running ones
-        self._planned = runs.Plan()
+        self._planned = runs.PlannedRuns()
         self._done = 0
         self._running: dict[str, int] = {}
         self._ended_runs = 0
@@ -516,7 +516,7 @@ class WatchedRuns:
         done = self._done + sum(self._running.values())
         self._advance(done, self._planned.frames.total() or None, step)
 
-    def _plan(self, plan: runs.Plan) -> None:
+    def _plan(self, plan: runs.PlannedRuns) -> None:
         self._planned = plan
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
@@ -577,8 +577,8 @@ def event_text(event: runs.RunEvent) -> str:
     return f"{text}, writing {', '.join(files)}"
 
 
-def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
-    """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
+def describe_plan(plan: runs.PlannedRuns, store: runs.RunStore, jobs: int, protocol: str) -> str:
+    """Number of frames to be tracked, and the expected time by this machine's stored runs of the same trackers."""
     from dynslam_bench.core.fingerprint import this_machine  # loads numpy
 
     plural = "s" if plan.runs != 1 else ""

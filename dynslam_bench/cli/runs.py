@@ -1,4 +1,7 @@
-"""``runs list|show|rescore|merge|export|rm`` and ``bank add|verify|pull|push``, and runs as the rows of a table."""
+"""``runs list|show|rescore|merge|export|rm``, ``bank add|verify|pull|push|reproduce|check|index``.
+
+Beside these verbs: runs as the rows of a table.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import re
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from itertools import pairwise, product
 from operator import itemgetter
 from pathlib import Path
@@ -14,13 +18,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from dynslam_bench import runs as stored
+from dynslam_bench.cli.metric_tables import statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
+    DataRoot,
     ProtocolId,
     Results,
     complete_sequences,
     complete_statuses,
     complete_trackers,
+    names_of,
 )
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
@@ -42,6 +49,7 @@ from dynslam_bench.core import (
     translate_errors,
     write_atomic,
 )
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
@@ -50,9 +58,9 @@ if TYPE_CHECKING:
 COLUMNS = {
     "run": "run_id",
     "tracker": "tracker",
+    "ATE (mm)": "ate_rmse_m",
     "sequence": "sequence",
     "status": "status",
-    "ATE (mm)": "ate_rmse_m",
     "ms/frame": "frame_ms",
     "frames": "frames",
     "repeat": "repeat",
@@ -65,7 +73,7 @@ COLUMNS = {
     "from the store": "from_store",
     "study": "study",
 }
-"""Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+"""Headings of the table, the most important first, and the names of what stands below them (see `make_run_row`)."""
 _IN_METRES = ("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m")
 """Errors of a row in metres, which are shown in millimetres."""
 MOST_REMARKS = 10
@@ -82,7 +90,7 @@ COLOURS = {
     "invalid": 31,
 }
 """Colours of the statuses on a terminal, as ANSI codes."""
-# Columns that `runs list` sorts by, and the names of those in a row that differ (see `run_row`).
+# Columns that `runs list` sorts by, and the names of those in a row that differ (see `make_run_row`).
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
@@ -188,7 +196,7 @@ def show(
             lines += [
                 "",
                 f"{which}: {evaluation.summary()}",
-                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                statistics_table(evaluation.metrics),
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
@@ -258,6 +266,55 @@ def export(
 
 
 @app.command()
+def archive(
+    server: Annotated[
+        str,
+        typer.Argument(
+            help="eth3d or kitti.",
+            autocompletion=names_of("runs.exchange.server_archives:SERVERS"),
+        ),
+    ],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="The archive, a .zip.")],
+    tracker: Annotated[
+        str, typer.Option(help="Id or label of the tracker.", autocompletion=complete_trackers)
+    ],
+    online: Annotated[
+        bool, typer.Option("--online", help="The causal poses, not the final ones.")
+    ] = False,
+    results: Results = Path("results"),
+    as_json: AsJson = False,
+) -> None:
+    """Write a tracker's runs as an archive for the server of ETH3D or KITTI."""
+    from dynslam_bench.runs.exchange.server_archives import write_server_archive
+
+    which = "online" if online else None
+    written = write_server_archive(server, output, tracker, results=results, which=which)
+    lines = [f"{name}: run {run_id}" for name, run_id in sorted(written.runs.items())]
+    present(written, *lines, str(written.file))
+    for line in written.notes:
+        announce(line)
+
+
+def describe(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of a rendered sequence, a Minari data set or a bank; or a rendered id."
+        ),
+    ],
+    url: Annotated[str, typer.Option(help="Where the data set is published.")] = "",
+    creator: Annotated[str, typer.Option(help="Who publishes it.")] = "dynslam-bench contributors",
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write Croissant metadata and a data card beside a data set."""
+    from dynslam_bench.runs.exchange.dataset_metadata import describe_data
+
+    described = describe_data(source, url=url, creator=creator, data_root=data_root)
+    present(described, f"{described.kind}:", str(described.croissant), str(described.card))
+
+
+@app.command()
 def rm(
     runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,
     results: Results = Path("results"),
@@ -287,12 +344,15 @@ def add(
         ),
     ],
     bank: Folder,
+    protocol: Annotated[
+        str, typer.Option(help="Protocol of a new bank's errors; default tum-rgbd/v1.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Add runs without trials of studies; exit with 3 if one is left out, e.g. for another result that is there."""
     from dynslam_bench.runs.bank import add
 
-    show_merged(add(sources, bank), str(bank))
+    show_merged(add(sources, bank, protocol=protocol), str(bank))
 
 
 @banks.command()
@@ -338,6 +398,94 @@ def push(
     show_merged(push(bank, target), target)
 
 
+@banks.command()
+def reproduce(
+    bank: Folder,
+    row: Annotated[str, typer.Argument(help="Id of the row, or its first digits.")],
+    by: Annotated[str, typer.Option("--by", help="Your name, as the mark shows it.")],
+    tracker: Annotated[
+        str, typer.Option(help="Where the tracker is here, if its id does not find it.")
+    ] = "",
+    sequence: Annotated[
+        str, typer.Option(help="Folder of the sequence here, if its id does not find it.")
+    ] = "",
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Further starts, run where the result is not equal.")
+    ] = 2,
+    results: Annotated[Path, typer.Option(help="Results folder for the new runs.")] = Path(
+        "results/reproduced"
+    ),
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a row again, and add a mark if it comes out as it did; exit with 4 if it does not."""
+    from dynslam_bench.runs.reproducing import reproduce as run_again
+
+    with progress("reproducing") as advance:
+        done = run_again(
+            bank,
+            row,
+            by=by,
+            tracker=tracker,
+            sequence=sequence,
+            repeats=repeats,
+            results=results,
+            data_root=data_root,
+            on_step=lambda step: advance(0, None, step),
+        )
+    lines = [f"{done.mark.run_id}: {done.describe()}"]
+    if done.mark.changed:
+        lines.append(f"other parts here: {', '.join(done.mark.changed)}")
+    lines.append(f"marked by {by}" if done.reproduced else f"no mark; the new run is {done.folder}")
+    present({"reproduced": done.reproduced, "mark": done.mark}, *lines, verified=done.reproduced)
+
+
+@banks.command()
+def check(
+    submission: Annotated[Path, typer.Argument(help="A bank with the rows that are to be added.")],
+    bank: Annotated[
+        Optional[Path], typer.Option("--bank", help="The bank that is to get them.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say whether a submission is accepted: exit with 0 if it is, with 4 if not, with 1 if it is no bank."""
+    from dynslam_bench.runs.submissions import check_submission
+
+    checked = check_submission(submission, bank)
+    facts = f"{checked.rows} rows, {len(checked.new)} new"
+    verdict = f"accepted: {facts}, errors under {checked.protocol}"
+    if not checked.accepted:
+        verdict = f"refused: {len(checked.faults)} fault{'s' * (len(checked.faults) != 1)}"
+    present(
+        {**asdict(checked), "accepted": checked.accepted},
+        *checked.faults,
+        f"{checked.checker}: {submission} is {verdict}",
+        verified=checked.accepted,
+    )
+
+
+@banks.command()
+def index(bank: Folder, as_json: AsJson = False) -> None:
+    """List the rows of a bank, and write its index page: sequences, trackers, protocol, rows, marks."""
+    from dynslam_bench.runs.bank_index import write_bank_index
+
+    page, rows = write_bank_index(bank)
+    columns = ("row", "tracker", "sequence", "ATE (mm)", "standing", "status", "coverage")
+    cells = [
+        (
+            row.run_id,
+            row.tracker,
+            row.sequence,
+            None if row.ate_m is None else 1000 * row.ate_m,
+            row.standing,
+            row.status,
+            row.coverage,
+        )
+        for row in rows
+    ]
+    present({"page": page, "rows": [asdict(row) for row in rows]}, table(columns, cells), str(page))
+
+
 def show_merged(merged: Merged, target: str) -> None:
     """Show what was copied into a store; exit with 3 if something was left out."""
     plural = "s" if len(merged.added) != 1 else ""
@@ -352,6 +500,8 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    from dynslam_bench.runs.record import coverage_text
+
     # empty and zero values stand for "nothing to say"
     identity = "unverified: its id does not tell the contents of data and code"
     return {
@@ -363,11 +513,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
         "sequence": record.sequence.id,
         "frames": stored.part_words(record),
-        "n_frames": record.n_frames,
-        "tracked": record.n_tracked,
+        "tracked": record.poses_words,
         "lost": record.n_lost,
         "initialising": record.n_initialising or None,
-        "coverage": record.coverage,
+        "coverage": coverage_text(record.coverage, record.truth_share),
         "repeat": record.repeat,
         "masks": record.segmentation,
         "device": record.device,
@@ -400,18 +549,31 @@ def show_runs(
         reused: Ids of the runs that are marked as taken from the store.
 
     Returns:
-        The table's rows, see `run_row`.
+        The table's rows, see `make_run_row`.
     """
     rows = []
     for record in records:
         # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
-        rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
+        rows.append(stored.make_run_row(record, metrics) | {"from_store": record.run_id in reused})
     if len(rows) == 1 and not json_mode():
         show_run(rows[0], store)
     else:
         show_rows(rows, store, protocol)
     return rows
+
+
+def covariance_words(row: Mapping[str, Any]) -> str:
+    """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
+    parts = []
+    for span, over in (("1f", "one frame"), ("1s", "one second")):
+        ratio = row.get(f"nees_{span}_mean")
+        if ratio is not None:
+            within = row.get(f"within95_{span}", 0.0)
+            parts.append(
+                f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
+            )
+    return ", ".join(parts)
 
 
 def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
@@ -424,10 +586,10 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     # the error beside that of a camera that does not move
     error = ""
     if row["ate_rmse_m"] is not None:
-        error = f"{millimetres(row['ate_rmse_m'])} mm"
+        error = f"{mm(row['ate_rmse_m'])} mm"
     static_m = row["static_camera_ate_rmse_m"]
     if error and static_m and row["false_motion_max_m"] is None:
-        error += f", not moving {millimetres(static_m)} mm"
+        error += f", not moving {mm(static_m)} mm"
     false_motion = row["false_motion_max_m"]
 
     # the trajectories that the run left
@@ -438,8 +600,9 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
             trajectories[name] = str(path)
     facts = {
         "ATE": error,
-        "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
-        "frames": f"{record.n_tracked} of {record.n_frames} tracked",
+        "false motion": "" if false_motion is None else f"{mm(false_motion)} mm at most",
+        "covariances": covariance_words(row),
+        "tracked": record.poses_words,
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
         "masks": shown_cell("segmentation", row["segmentation"]),
@@ -483,7 +646,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 
 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    """Lines below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
     # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")
@@ -548,18 +711,12 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     return {run_id: run_id[:count] for run_id, count in digits.items()}
 
 
-def millimetres(metres: float) -> str:
-    """Metres as millimetres with three significant digits."""
-    value = f"{1000.0 * metres:#.3g}"
-    return f"{1000.0 * metres:.0f}" if "e+" in value else value.rstrip(".")
-
-
 def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: errors in millimetres, paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
     if name in _IN_METRES and isinstance(value, float):
-        return millimetres(value)
+        return mm(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 

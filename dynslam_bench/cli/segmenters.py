@@ -82,7 +82,7 @@ def evaluate(
         str, typer.Argument(help="synthetic:..., sequence:ID, coco:FILE[:IMAGES] or yolo:DIR.")
     ],
     source: Annotated[
-        str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")
+        str, typer.Option(help="embedded, coco, selfie, weights:PATH, onnx:PATH, recorded:DIR ...")
     ] = "embedded",
     set_options: MaskAssignments = None,
     output: Annotated[
@@ -128,7 +128,9 @@ def record(
     output: Annotated[
         Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")
     ],
-    source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
+    source: Annotated[
+        str, typer.Option(help="coco, selfie, weights:PATH, onnx:PATH, oracle ...")
+    ] = "auto",
     set_options: MaskAssignments = None,
     frames: Frames = None,
     data_root: DataRoot = None,

@@ -37,7 +37,7 @@ Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
 
 @app.callback()
 def silence_optuna() -> None:
-    """Studies: tune a tracker's settings through its environment."""  # the group's help
+    """Silence Optuna's messages before every command of the group."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -51,7 +51,7 @@ def space(
     study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False
 ) -> None:
     """Show which settings a study tunes, what its scenes could show, and how long it takes."""
-    plan = tuning.Plan(tuning.read_study(study), results)
+    plan = tuning.StudyPlan(tuning.read_study(study), results)
     preview = plan.preview(jobs)
 
     rows = []

@@ -1,4 +1,4 @@
-"""What may be plugged in, and what the plug-ins exchange; a plug-in imports from here, from settings and errors only.
+"""Protocols of plug-ins and the types they exchange; a plug-in imports from here, from settings and errors only.
 
 Importing this package loads neither torch nor OpenCV, numba, scipy, Gymnasium or Optuna.
 

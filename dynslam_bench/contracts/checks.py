@@ -1,4 +1,4 @@
-"""What is demanded of a tracker's results: written once, for the environment and for the conformance suite.
+"""Checks of a tracker's results: written once, for the environment and for the conformance suite.
 
 A *fault* makes a run ``invalid``: the environment refuses the result. A *blemish* is refused by the
 conformance suite only: no number is wrong because of it.
@@ -12,6 +12,7 @@ from numbers import Real
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts.sequence import Frame, Sequence
 from dynslam_bench.contracts.tracker import TrackerSpec, TrackingState, TrackResult
@@ -77,7 +78,7 @@ def check_frame(frame: Frame, camera: Camera) -> None:
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with something that was returned.
+    """Fault of a returned value.
 
     Attributes:
         found: What was returned, to be read after "returned".
@@ -89,7 +90,7 @@ class Fault:
 
 
 def faults(result: object, frame: Frame) -> Iterator[Fault]:
-    """What makes a result invalid: its type, state, pose, numbers, keypoints, or a mask of another size than the image.
+    """Faults that make a result invalid: type, state, pose, numbers, keypoints, or a mask of another size.
 
     Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
     """
@@ -128,7 +129,7 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
 
 
 def _keypoint_faults(result: TrackResult) -> Iterator[Fault]:
-    """What is wrong with the keypoints' pixels, or with which of them were kept."""
+    """Faults of the keypoints' pixels, or of the flags of those that were kept."""
     xy: Any = result.keypoints_xy
     keep = result.keypoints_keep
     if xy is not None and not _is_number_array(xy, columns=2):
@@ -141,13 +142,15 @@ def _keypoint_faults(result: TrackResult) -> Iterator[Fault]:
 
 
 def blemishes(result: TrackResult) -> Iterator[Fault]:
-    """What is wrong with a result that has no faults, in values that no metric is made of."""
+    """Faults of a valid result in values that no metric is made of: stats, timings, mask."""
     for name, values in (("stats", result.stats), ("timings", result.timings)):
         bad = {key: value for key, value in values.items() if not _is_number(value)}
         if bad:
             yield Fault(f"{name} with values that are no finite numbers: {bad}")
     if any(_is_number(value) and value < 0 for value in result.timings.values()):
         yield Fault("a timing that is negative")
+    if result.motion_covariance is not None:
+        yield from _covariance_blemishes(result.motion_covariance)
     mask = result.dynamic_mask
     if mask is not None and getattr(mask, "dtype", None) != np.bool_:
         yield Fault(
@@ -155,8 +158,21 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
         )
 
 
+def _covariance_blemishes(value: object) -> Iterator[Fault]:
+    """Faults of a motion covariance; runs state it, and score the others."""
+    expected = "expected a 6x6 covariance of (translation in m, rotation in rad)"
+    matrix = as_covariance(value)
+    if not np.isfinite(matrix).all():
+        yield Fault(f"a motion covariance of shape {np.shape(value)}, or not finite", expected)
+    elif not np.allclose(matrix, matrix.T):
+        off = float(np.abs(matrix - matrix.T).max())
+        yield Fault(f"a motion covariance that is not symmetric, by {off:.2g}", expected)
+    elif (least := float(np.linalg.eigvalsh(matrix)[0])) <= 0:
+        yield Fault(f"a motion covariance with the eigenvalue {least:.2g}", expected)
+
+
 def trajectory_faults(trajectory: object) -> Iterator[Fault]:
-    """What makes a final trajectory invalid: its type, or a pose that is no rigid transformation."""
+    """Faults that make a final trajectory invalid: its type, or a pose that is no rigid transformation."""
     if not isinstance(trajectory, Trajectory):
         yield Fault(f"a {type(trajectory).__name__}, not a Trajectory")
         return
@@ -173,7 +189,7 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         tracker: The tracker's id, for the message.
 
     Returns:
-        The result, its pose in float64, without statistics that are not finite.
+        The result, pose and covariance in float64, without statistics that are not finite.
 
     Raises:
         TrackerContractError: It has a fault.
@@ -185,7 +201,19 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     pose = None if result.T_world_cam is None else np.asarray(result.T_world_cam, dtype=np.float64)
-    return replace(result, stats=stats, T_world_cam=pose)
+    covariance = result.motion_covariance
+    if covariance is not None:
+        covariance = as_covariance(covariance)
+    return replace(result, stats=stats, T_world_cam=pose, motion_covariance=covariance)
+
+
+def as_covariance(value: object) -> NDArray[np.float64]:
+    """A covariance float64 ``[6, 6]`` of what a tracker gave; NaN where that is no array of 36 numbers."""
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.full((6, 6), np.nan)
+    return matrix.reshape(6, 6) if matrix.size == 36 else np.full((6, 6), np.nan)
 
 
 def check_sensors(spec: TrackerSpec, sequence: Sequence) -> None:
@@ -224,7 +252,7 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
 
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
-    """What is wrong with a camera-to-world pose: its shape, type, numbers, or that it is no rigid transformation."""
+    """Faults of a camera-to-world pose: shape, type, numbers, or that it is no rigid transformation."""
     if not isinstance(pose, np.ndarray):
         yield Fault(f"a {type(pose).__name__} as pose, expected a 4x4 matrix")
     elif pose.shape != (4, 4):

@@ -19,7 +19,7 @@ from dynslam_bench.geometry import Camera
 Need = Literal[
     "masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"
 ]
-"""What a filter asks for: `FilterState` and `FrameBundle` hold it."""
+"""An input that a filter asks for; `FilterState` and `FrameBundle` hold it."""
 
 
 @dataclass(eq=False)

@@ -64,7 +64,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class SegmenterContext:
-    """What a segmenter may know of its run: sequence, device, threads, source.
+    """Facts of the run that a segmenter may use: sequence, device, threads, source.
 
     Attributes:
         sequence_id: Id of the sequence.

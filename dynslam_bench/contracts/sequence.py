@@ -88,7 +88,7 @@ class Sequence(Protocol):
 
     @property
     def citation(self) -> str:
-        """What to cite."""
+        """Citation of the data set, as text."""
 
     def digest(self) -> str:
         """Short digest of the content (files' names and sizes, or the renderer's version and parameters)."""

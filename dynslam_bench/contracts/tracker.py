@@ -38,7 +38,7 @@ class Tracker(Protocol):
 
 @dataclass(frozen=True)
 class TrackerContext:
-    """What a tracker may be told of where it runs; never the ground-truth poses.
+    """Facts of the run that a tracker may use; never the ground-truth poses.
 
     Attributes:
         sequence_id: Id of the sequence, for presets and `segmentation.source = auto`.
@@ -86,8 +86,8 @@ class TrackerSpec:
         remarks: Name collisions and known limits, e.g. "marks nothing as lost".
         parameter: Name of the setting that takes what follows the id in ``id:value``
             (``replay:FILE``); empty if the tracker takes none.
-        bound: Settings fixed by the way it was named, dotted name to value;
-            ``TRACKERS.get("id:value")`` fills it in.
+        fixed_settings: Settings that its id fixes, dotted name to value; the registry fills it in:
+            ``replay:FILE`` fixes the file.
         check: ``"module:function"``; the function returns an install hint if the tracker cannot run
             here although all of `requires` can be imported, else an empty string.
         online: Whether it gives poses frame by frame; of a batch program only the final trajectory
@@ -119,7 +119,7 @@ class TrackerSpec:
     published_as: tuple[str, ...] = ()
     remarks: str = ""
     parameter: str = ""
-    bound: Mapping[str, Any] = field(default_factory=dict)
+    fixed_settings: Mapping[str, Any] = field(default_factory=dict)
     check: str = ""
     files: str = ""
     online: bool = True
@@ -164,6 +164,10 @@ class TrackResult:
         dynamic_mask: bool ``[H, W]``, pixels held for dynamic, or None.
         keypoints_xy: float32 ``[N, 2]``, raw pixels of the features, for rendering; or None.
         keypoints_keep: bool ``[N]``, which of them were kept; or None.
+        motion_covariance: Covariance float64 ``[6, 6]`` of the motion ``T_prev_cur`` from the last
+            frame with a pose to this one: of the twist (translation in metres, rotation in radians)
+            in ``T_true = T_estimated Exp(twist)``; None if the tracker does not know how sure it
+            is. It is scored, and changes no pose.
     """
 
     T_world_cam: NDArray[np.float64] | None
@@ -173,6 +177,7 @@ class TrackResult:
     dynamic_mask: NDArray[np.bool_] | None = None
     keypoints_xy: NDArray[np.float32] | None = None
     keypoints_keep: NDArray[np.bool_] | None = None
+    motion_covariance: NDArray[np.float64] | None = None
 
 
 def stage_seconds(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Which files a program is made of: its code, and the data files beside it that its code names."""
+"""Files that a program is made of: its code, and the data files beside it that its code names."""
 
 import ast
 import os
@@ -15,7 +15,7 @@ from pathlib import Path
 from dynslam_bench.core.module_graph import parsed
 
 CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
-"""How the names of Python sources and native libraries end."""
+"""Endings of the names of Python sources and native libraries."""
 _TEXT = (
     ".py",
     ".sh",
@@ -41,7 +41,7 @@ _TEXT = (
     ".h",
     ".hpp",
 )
-"""How scripts, sources, configurations and lists end, which may name other files."""
+"""Endings of scripts, sources, configurations and lists, which may name other files."""
 _SOURCES = (b".c", b".cc", b".cpp", b".cxx", b".cu", b".h", b".hpp", b".hxx", b".inl", b".ipp")
 """A compiled program holds the names of its sources, which it does not read."""
 _LARGEST_TEXT = 1 << 20
@@ -49,11 +49,11 @@ _LARGEST_TEXT = 1 << 20
 _LARGEST_BINARY = 1 << 22
 """Bytes of the largest compiled program that is searched: 4 MB take a tenth of a second."""
 _ELF = b"\x7fELF"
-"""How compiled programs of Linux begin."""
+"""First bytes of compiled programs of Linux."""
 _NAME_IN_BINARY = re.compile(rb"[\w./~+\-]{1,300}\.[A-Za-z]\w{0,9}")
 """The name of a file with an ending."""
 _WORD = re.compile(rb"[\w./~+\-]+")
-"""What could be a path, quoted or not."""
+"""A word that could be a path, quoted or not."""
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
@@ -70,7 +70,7 @@ _SYSTEM = (
     "/opt/local/",
     "/System/",
 )
-"""Where files of the operating system lie."""
+"""Folders of the operating system's files."""
 _STORE = ("index.sqlite", "sequences", "latest")
 """A folder with ``runs/`` and one of these is a results folder."""
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
@@ -166,6 +166,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
             continue
         for node in nodes:
+            # import statements, and calls whose first argument is a module's name
             if isinstance(node, ast.Import):
                 modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
@@ -176,6 +177,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
                 is_import = function.endswith(("import_module", "__import__"))
                 if is_import and isinstance(argument, ast.Constant):
                     modules.add(str(argument.value))
+    # the first part of each
     return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 

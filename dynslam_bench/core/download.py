@@ -34,7 +34,7 @@ _GO_ON = "run the same command again, it goes on from there"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a fetch is.
+    """Progress of a fetch.
 
     Attributes:
         stage: What is being done.
@@ -51,7 +51,7 @@ Report = Callable[[Progress], None]
 Display = Callable[[str], contextlib.AbstractContextManager[Report]]
 """Shows the download of a file of that name as long as the context lasts."""
 _display: list[Display] = []
-"""What `show_downloads` was given, in a list of one; empty where nothing is shown."""
+"""The display given to `show_downloads`, in a list of one; empty where nothing is shown."""
 
 
 def show_downloads(display: Display) -> None:

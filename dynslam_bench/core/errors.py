@@ -135,7 +135,7 @@ class RunError(DynslamError):
 
 
 class InfrastructureError(RunError):
-    """What a run needs broke, and not the run: a full disk, a process that was killed.
+    """A fault of what a run needs, not of the run: a full disk, a process that was killed.
 
     It is no outcome of a tracker, so nothing is stored, and the same command goes on from there.
     """
@@ -177,7 +177,7 @@ def translate_errors(
 
 
 def reason_of(error: BaseException) -> str:
-    """What went wrong in the words of the library or of the system, one short line."""
+    """Reason for an error in the words of the library or of the system, one short line."""
     if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
         source, _, reason = error.args[0][0]  # a folder could not be copied: the first of its files
         return f"{reason} ({source})"

@@ -1,4 +1,4 @@
-"""What a result was made of: digests of code, weights, machine and content.
+"""Identity of what a result was made of: digests of code, weights, machine and content.
 
 Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of
 what plug-ins read (`core.reads`): where anything of it differs, so does the id.
@@ -40,7 +40,7 @@ OPENCV = (
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
-_FILE_PREFIXES = ("onnx", "weights", "recorded")
+_FILE_PREFIXES = ("onnx", "tflite", "weights", "recorded")
 """Segmenters' ids that begin so, with a colon, name a file or folder."""
 _MANY_FILES = 200
 """A folder with more files holds data: a word that happens to be its name does not name it."""
@@ -53,7 +53,8 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
     """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
     A setting counts that is declared to name a file (`core.settings.names`), a path in it at any
-    depth of lists and tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``.
+    depth of lists and tables, and a text with the prefix ``onnx:``, ``tflite:``,
+    ``weights:`` or ``recorded:``.
     So does a text that is written as a path, with a separator, or as a file's name with an ending,
     where that is there. ``~`` and ``$VARIABLE`` are replaced. A bare word without an ending is a
     word, whatever lies in the working folder, unless `words` is set. The description of a tracker

@@ -1,4 +1,4 @@
-"""Which libraries a run computes with: what lies under a module's name on the import path."""
+"""Libraries that a run computes with: versions of what lies under a module's name on the import path."""
 
 import os
 import sys

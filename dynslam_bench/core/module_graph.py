@@ -1,4 +1,4 @@
-"""Which modules of this package a module uses, and the digest of their code.
+"""Modules of this package that a module uses, and the digest of their code.
 
 The closure of a module holds itself and all modules of this package that it reaches by import
 statements, wherever in the source they stand. A package's ``__init__`` that passes a name on is
@@ -50,7 +50,7 @@ _PLUMBING = (
 PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
 SETTLED_NS = 2_000_000_000
-"""What was read of a younger file is not remembered: a change within the same tick of the clock would not show."""
+"""Least age of a file whose content is remembered: a change within the same tick of the clock would not show."""
 _BYTE_CODE_HEADER = struct.Struct("<4sIII")
 """Python's magic number, flags, second of the source's modification and its size (PEP 552)."""
 _PARSING = threading.Lock()

@@ -175,7 +175,7 @@ class Registry(Generic[P]):
         return None
 
     def listed(self) -> list[Listed]:
-        """What the environment variable and the installed distributions list; nothing is imported.
+        """Plug-ins that the environment variable and the installed distributions list; nothing is imported.
 
         In the process of a run the variable lists what the run uses, and installed ones are left
         out; see `used`.

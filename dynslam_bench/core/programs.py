@@ -1,4 +1,4 @@
-"""What the processes of a program are made of, and which environment variables a program gets.
+"""Files that the processes of a program are made of, and the environment variables that a program gets.
 
 What a program opens cannot be seen from outside. What its processes show can: the executable, the
 libraries and other files that are mapped into memory, the files and folders that the command line

@@ -172,7 +172,7 @@ def names(
 
 
 def references_of(settings: Settings) -> dict[str, tuple[str, str]]:
-    """What the settings name: dotted name to ``(kind, value)``, see `names`; fields that name nothing are left out.
+    """References in the settings: dotted name to ``(kind, value)``, see `names`; fields that name nothing are left out.
 
     A field of type `Path` counts as a file, too.
     """

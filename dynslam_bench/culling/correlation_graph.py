@@ -139,7 +139,16 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
     def _observe(
         self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
     ) -> NDArray[np.float64]:
-        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
+        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth.
+
+        Args:
+            xy: Undistorted pixels ``[N, 2]``.
+            raw: Raw pixels ``[N, 2]``, as the lens distorts them.
+            z: Depths there ``[N]``, metres, 0 or NaN missing.
+            depth: The whole depth image ``[H, W]``, whose scatter around each pixel gives the
+                variance.
+            camera: Intrinsics.
+        """
         points = np.full((len(xy), 12), np.nan)
         valid = np.isfinite(z) & (z > 0)
         pixels = np.asarray(xy[valid], np.float64)
@@ -156,7 +165,7 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
         observed: NDArray[np.bool_],
         edges: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
-        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed.
+        """Flags ``[E]`` of edges that keep their vector since the oldest frame in which both ends were observed.
 
         Args:
             current: World positions and covariances ``[N, 3 + 9]`` of this frame's points.
@@ -187,7 +196,7 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
     def _static_component(
         self, edges: NDArray[np.intp], points: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], int]:
-        """Which points ``[N]`` are in the largest component of the edges ``[E, 2]``, and the number of components."""
+        """Flags ``[N]`` of points in the largest component of the edges ``[E, 2]``, and the number of components."""
         graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(points), len(points)))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.ape import (
     absolute_errors,
@@ -19,12 +20,20 @@ from dynslam_bench.evaluation.comparison import (
     Comparison,
     apply_policy,
     compare,
+    share_of_time,
     truth_of_file,
 )
 from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
-from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
+from dynslam_bench.evaluation.uncertainty import (
+    NO_NOISE,
+    PoseNoise,
+    Uncertainty,
+    motion_uncertainty,
+)
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory, load_trajectory
+from dynslam_bench.geometry.motion_covariances import MotionCovariances
 
 SCHEMA_VERSION = 1
 METRICS: tuple[Callable[[Comparison], dict[str, float]], ...] = (
@@ -63,13 +72,16 @@ class Evaluation(Record):
             move scores under the same alignment. The statistics are rmse, mean, median, std, min,
             max, sse. Where the true camera stands still, the false motion: ``false_motion_path_m``,
             the length of the estimated path, and ``false_motion_max_m``, its largest distance from
-            its first pose.
+            its first pose. Where the tracker gave covariances of its motions, their scores, see
+            `Uncertainty`.
         n_pairs: Pairs of poses that the absolute error is taken over.
         n_pairs_rpe: Pairs of poses that each relative error is taken over, by its key.
         n_input: Input frames; None where they are not known.
         n_tracked: Input frames with a tracked pose; None where the input frames are not known.
         coverage: Share of the input frames with a tracked pose, 0 to 1; None where they are not
             known.
+        truth_share: Share of the ground truth's time that the estimate has poses for, 0 to 1, see
+            `share_of_time`; it tells what the coverage cannot where the input frames are not known.
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
         diagnostics: One line for each fact that the numbers depend on.
@@ -86,17 +98,21 @@ class Evaluation(Record):
     n_input: int | None = None
     n_tracked: int | None = None
     coverage: float | None = None
+    truth_share: float | None = None
     alignment: AlignmentRecord
     association: AssociationRecord
     diagnostics: list[str]
     warnings: list[str] = Field(default_factory=list)
 
     def summary(self) -> str:
-        """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
-        share = self.coverage
-        covered = "" if share is None else f", {100 * share:.1f} % of {self.n_input} frames tracked"
+        """The ATE with what it depends on, e.g. ``ATE (rmse) 14.2 mm over 848 poses [tum-rgbd/v1 ...]``."""
+        covered = ""
+        if self.coverage is not None:
+            covered = f", {100 * self.coverage:.1f} % of {self.n_input} frames tracked"
+        elif self.truth_share is not None:
+            covered = f", {100 * self.truth_share:.1f} % of the truth's time"
         return (
-            f"ATE (rmse) {self.metrics['ate_rmse_m']:.4f} m over {self.n_pairs} poses{covered} "
+            f"ATE (rmse) {mm(self.metrics['ate_rmse_m'])} mm over {self.n_pairs} poses{covered} "
             f"[{self.protocol_id} {self.protocol_digest}]"
         )
 
@@ -107,6 +123,8 @@ def evaluate(
     protocol: Protocol | str = "tum-rgbd/v1",
     *,
     input_timestamps: ArrayLike | None = None,
+    motion_covariances: MotionCovariances | None = None,
+    truth_noise: PoseNoise = NO_NOISE,
 ) -> Evaluation:
     """Absolute and relative pose errors of a trajectory.
 
@@ -117,6 +135,9 @@ def evaluate(
         protocol: A protocol or the id of a registered one.
         input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the
             lost-frame policy ``hold``.
+        motion_covariances: What the tracker says of its errors, see `motion_uncertainty`; they are
+            scored with poses in metres alone.
+        truth_noise: Noise of the true poses, for the covariances.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is
@@ -129,6 +150,10 @@ def evaluate(
     # the policy for lost frames, then association and alignment
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []
+    uncertainty = Uncertainty()
+    if motion_covariances is not None and not protocol.finds_scale:
+        uncertainty = motion_uncertainty(estimate, motion_covariances, ground_truth, truth_noise)
+    truth_share = share_of_time(estimate.timestamps, ground_truth.timestamps)
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     if protocol.finds_scale:
@@ -140,6 +165,8 @@ def evaluate(
     metrics: dict[str, float] = {}
     for measure in METRICS:
         metrics |= measure(comparison)
+    metrics |= uncertainty.metrics
+    diagnostics += uncertainty.diagnostics
     similarity = comparison.similarity
     return Evaluation(
         protocol_id=protocol.id,
@@ -151,6 +178,7 @@ def evaluate(
         n_input=None if tracked is None else len(tracked),
         n_tracked=None if tracked is None else int(tracked.sum()),
         coverage=None if tracked is None else float(tracked.mean()),
+        truth_share=truth_share,
         alignment=AlignmentRecord(
             mode=protocol.alignment,
             rotation=similarity.rotation.tolist(),
@@ -161,7 +189,7 @@ def evaluate(
         ),
         association=comparison.association,
         diagnostics=diagnostics,
-        warnings=warnings_of(comparison, metrics),
+        warnings=[*warnings_of(comparison, metrics), *uncertainty.warnings],
     )
 
 
@@ -194,7 +222,7 @@ def evaluate_files(
 
 
 def evaluate_loaded(
-    estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str
+    estimate: LoadedTrajectory, ground_truth: LoadedTrajectory, protocol: Protocol | str
 ) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 

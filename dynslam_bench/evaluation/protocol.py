@@ -35,7 +35,7 @@ _PHRASES = {
     "consecutive": "consecutive pairs",
     "all": "all pairs",
 }
-"""What the choices of a protocol are called in its description."""
+"""Words for the choices of a protocol in its description."""
 
 
 class _Frozen(BaseModel):
@@ -43,7 +43,7 @@ class _Frozen(BaseModel):
 
 
 class RPESpec(_Frozen):
-    """Which pairs of poses the relative pose error (the paper's Eq. 26) is taken over.
+    """Choice of the pairs of poses that the relative pose error (the paper's Eq. 26) is taken over.
 
     Attributes:
         delta: Distance between the poses of a pair; ignored by ``tum-random``.

@@ -1,4 +1,4 @@
-"""What paired errors show: the typical ratio of a candidate to a baseline, its losses, and a verdict.
+"""Statistics of paired errors: the typical ratio of a candidate to a baseline, its losses, and a verdict.
 
 All statistics are over scenes. A scene has one value: the natural logarithm of the candidate's error over
 the baseline's, below 0 is better. Errors of a few scenes may be huge, so nothing here is a mean of errors:
@@ -52,7 +52,7 @@ _WILCOXON_EFFICIENCY = 3.0 / math.pi
 _MOST_SCENES = 100_000
 
 
-class Verdict(str, Enum):
+class ComparisonVerdict(str, Enum):
     """A comparison's verdict on the candidate."""
 
     PROVEN = "proven"
@@ -100,7 +100,7 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> PseudoMed
 
 @lru_cache(maxsize=1024)
 def _critical_rank_sum(count: int, tail: float) -> int:
-    """How many values of the signed-rank sum of `count` scenes have at most `tail` of probability at one end."""
+    """Number of values of the signed-rank sum of `count` scenes that have at most `tail` of probability at one end."""
     # Exact null distribution: rank r is added or not, each with probability one half.
     probabilities = np.ones(1)
     for rank in range(1, count + 1):
@@ -354,7 +354,7 @@ def _bound(log_ratio: float) -> float | None:
 # -- the verdict -----------------------------------------------------------------------------------
 
 
-def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> Verdict:
+def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> ComparisonVerdict:
     """The verdict on a candidate: the first of the rules that holds.
 
     Args:
@@ -366,35 +366,35 @@ def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> Verdict:
 
     # more losses than the baseline's, beyond chance
     if comparison.loses_more:
-        return Verdict.WORSE
+        return ComparisonVerdict.WORSE
 
     # too few scenes for any claim
     low = comparison.low
     high = comparison.high
     if comparison.scenes < FEWEST:
-        return Verdict.CANNOT_TELL
+        return ComparisonVerdict.CANNOT_TELL
 
     # the typical error differs
     if low is not None and low > 1.0:
-        return Verdict.WORSE
+        return ComparisonVerdict.WORSE
     if high is not None and high < 1.0:
-        return Verdict.PROVEN if comparison.loses_no_more else Verdict.BUT_LOST
+        return ComparisonVerdict.PROVEN if comparison.loses_no_more else ComparisonVerdict.BUT_LOST
 
     # both ends of the interval within the margin: two one-sided tests (Schuirmann 1987)
     excluded = comparison.excluded
     if excluded is not None and excluded < margin and abs(losses - losses_baseline) <= 1:
-        return Verdict.NO_DIFFERENCE
+        return ComparisonVerdict.NO_DIFFERENCE
 
     # said in one of ten comparisons where nothing is better
     if comparison.high_80 is not None and comparison.high_80 < 1.0:
-        return Verdict.PROMISING
-    return Verdict.CANNOT_TELL
+        return ComparisonVerdict.PROMISING
+    return ComparisonVerdict.CANNOT_TELL
 
 
 def findings(
     comparison: PairedRatio, subject: str = "the candidate", margin: float = MARGIN
 ) -> list[str]:
-    """What a comparison found, in short sentences without their full stops: claim, exclusion, every loss.
+    """Findings of a comparison in short sentences without full stops: claim, exclusion, every loss.
 
     Args:
         comparison: The candidate beside the baseline.
@@ -404,7 +404,7 @@ def findings(
     verdict = verdict_of(comparison, margin)
     sentences = [_claim(comparison, verdict, subject)]
     excluded = comparison.excluded
-    states_exclusion = verdict in (Verdict.NO_DIFFERENCE, Verdict.CANNOT_TELL)
+    states_exclusion = verdict in (ComparisonVerdict.NO_DIFFERENCE, ComparisonVerdict.CANNOT_TELL)
     if states_exclusion and excluded is not None and comparison.scenes >= FEWEST:
         sentences.append(f"Differences above {_percent_up(excluded)} % are excluded")
     if comparison.ties:
@@ -416,29 +416,29 @@ def findings(
     return sentences + _loss_sentences(comparison, subject)
 
 
-def _claim(comparison: PairedRatio, verdict: Verdict, subject: str) -> str:
+def _claim(comparison: PairedRatio, verdict: ComparisonVerdict, subject: str) -> str:
     """The first sentence: what the candidate has, beside the numbers that show it."""
     if comparison.ratio is None:
         if not comparison.all_scenes:
             return f"{subject} was compared on no scene"
-        more = " loses more scenes than the baseline:" if verdict is Verdict.WORSE else ""
+        more = " loses more scenes than the baseline:" if verdict is ComparisonVerdict.WORSE else ""
         of_all = f"both succeed on none of {_scenes(comparison.all_scenes)}"
         return f"{subject}{more} {of_all}" if more else f"{subject} and the baseline {of_all}"
     numbers = f"{comparison} on {_scenes(comparison.scenes)}"
     percent = abs(100.0 * (1.0 - comparison.ratio))
-    if verdict is Verdict.PROVEN:
+    if verdict is ComparisonVerdict.PROVEN:
         return f"{subject} has {percent:.1f} % less {comparison.what}: {numbers}"
-    if verdict is Verdict.BUT_LOST:
+    if verdict is ComparisonVerdict.BUT_LOST:
         lost_in = f"{len(comparison.losses)} of {_scenes(comparison.all_scenes)}"
         if len(comparison.losses) <= len(comparison.losses_baseline):
             lost_in = f"{comparison.lost_runs[0]} of {comparison.runs} runs"
         typical = f"a smaller typical {comparison.what}"
         return f"{subject} has {typical}, but lost in {lost_in}: {numbers}"
-    if verdict is Verdict.PROMISING:
+    if verdict is ComparisonVerdict.PROMISING:
         return f"{subject} has perhaps {percent:.1f} % less {comparison.what}: {numbers}"
-    if verdict is Verdict.WORSE and comparison.loses_more:
+    if verdict is ComparisonVerdict.WORSE and comparison.loses_more:
         return f"{subject} loses more scenes than the baseline, where both succeed {numbers}"
-    if verdict is Verdict.WORSE:
+    if verdict is ComparisonVerdict.WORSE:
         return f"{subject} has {percent:.1f} % more {comparison.what}: {numbers}"
     if comparison.scenes < FEWEST:
         return f"{subject} has {numbers}, and {FEWEST} are the fewest for a claim"

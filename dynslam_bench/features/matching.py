@@ -64,6 +64,7 @@ def _brute_force(
         For each of `a` ``[N]``: the nearest of `b`, its distance and the second nearest's; for each
         of `b` ``[M]``: the nearest of `a`.
     """
+    # nothing is matched yet, and everything is `FAR`
     n = a.shape[0]
     m = b.shape[0]
     nearest = np.full(n, -1, np.int64)
@@ -145,9 +146,17 @@ class CellGrid:
 def _sorted_into_cells(
     xy: NDArray[np.float64], cell: float, columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`CellGrid.start` and `CellGrid.order`."""
+    """`CellGrid.start` and `CellGrid.order`.
+
+    Args:
+        xy: Pixels ``[N, 2]``.
+        cell: Side of a cell, pixels.
+        columns: Cells in a row.
+        rows: Rows of cells.
+    """
     cells = np.empty(len(xy), np.int64)
     for i in range(len(xy)):
+        # the cell of the point; the border cells take what lies outside
         column = min(max(xy[i, 0] // cell, 0), columns - 1)
         row = min(max(xy[i, 1] // cell, 0), rows - 1)
         cells[i] = int(row) * columns + int(column)
@@ -224,7 +233,15 @@ class _SearchTargets(NamedTuple):
 def _search(
     features: _SearchFeatures, targets: _SearchTargets, max_distance: int, ratio: float
 ) -> NDArray[np.int64]:
-    """Index of the feature that each target is matched to ``[M]``, -1 without; see `search_in_radius`."""
+    """Index of the feature that each target is matched to ``[M]``, -1 without; see `search_in_radius`.
+
+    Args:
+        features: Features to choose from.
+        targets: Where and with which descriptors they are looked for.
+        max_distance: Largest Hamming distance of a match.
+        ratio: Nearest over second nearest distance up to which a match is distinct.
+    """
+    # short names for the loops
     cell = features.cell
     columns = features.columns
     rows = features.rows
@@ -233,6 +250,7 @@ def _search(
     right = features.right
     octave = features.octave
 
+    # no target has a feature yet
     count = targets.xy.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
@@ -329,6 +347,7 @@ def search_in_radius(
         int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller
         distance wins, then the lower index.
     """
+    # compiled code reads named tuples
     grid = features.grid
     searched = _SearchFeatures(
         cell=grid.cell,
@@ -354,7 +373,7 @@ def rotation_consistent(
     bins: int = 30,
     share: float = 0.1,
 ) -> NDArray[np.bool_]:
-    """Which matches agree with the rotation in the image plane that most matches show.
+    """Flag matches that agree with the rotation in the image plane that most matches show.
 
     Args:
         angle_a: Keypoint orientations in the one image, degrees ``[N]``.

@@ -1,4 +1,4 @@
-"""Which DAISY Filter Flow settings ask for: at sparse points or dense.
+"""Choice of the DAISY Filter Flow that the settings ask for: at sparse points or dense.
 
 It lies apart from the registry of flows, so that a run with another flow does not depend on this
 one's code.

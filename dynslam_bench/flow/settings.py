@@ -24,7 +24,7 @@ SearchName = Literal[
 
 
 class FlowMethodSettings(Settings):
-    """What every flow has, and the few options of the OpenCV flows; enough for Lucas-Kanade and DIS."""
+    """Settings of every flow, and the few options of the OpenCV flows; enough for Lucas-Kanade and DIS."""
 
     method: Literal["daisy", "lucas-kanade", "dis"] = Field(
         "daisy",

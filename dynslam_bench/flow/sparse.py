@@ -202,7 +202,7 @@ class SparseDaisyFlow:
     def describe(
         self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables
     ) -> Reference:
-        """What the search needs of the reference points: their rotated descriptors and appearance."""
+        """Describe the reference points for the search: rotated descriptors and appearance."""
         count = len(points)
         supports = len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)

@@ -21,7 +21,7 @@ from dynslam_bench.geometry.stamps import (
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 from dynslam_bench.geometry.trajectory_files import (
     FileNotes,
-    TumFile,
+    LoadedTrajectory,
     format_tum,
     is_number,
     load_trajectory,
@@ -39,9 +39,9 @@ __all__ = [
     "Array",
     "Camera",
     "FileNotes",
+    "LoadedTrajectory",
     "RepeatedStamps",
     "Trajectory",
-    "TumFile",
     "are_frame_numbers",
     "associate",
     "at_width",

@@ -14,7 +14,7 @@ LONGEST_STEP_M = 1.0
 
 @dataclass(frozen=True)
 class ImpossibleMotion:
-    """What no camera does.
+    """A motion that no camera makes.
 
     Attributes:
         fault: What was measured.
@@ -31,7 +31,7 @@ class ImpossibleMotion:
 
 
 def impossible_motion(trajectory: Trajectory, whose: str) -> ImpossibleMotion | None:
-    """Which poses of a trajectory no camera reaches from one to the next; None where there are none.
+    """Find poses of a trajectory that no camera reaches from one to the next; None where there are none.
 
     Args:
         trajectory: The poses.

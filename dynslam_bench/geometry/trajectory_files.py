@@ -28,7 +28,7 @@ from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
 _TUM_COLUMNS = "timestamp tx ty tz qx qy qz qw"
-"""What stands in a line of TUM's format."""
+"""Columns of a line in TUM's format."""
 MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
@@ -90,7 +90,7 @@ class FileNotes:
 
 
 @dataclass(frozen=True, eq=False)
-class TumFile:
+class LoadedTrajectory:
     """A trajectory and the notes on the file it came from, TUM's or KITTI's.
 
     Attributes:
@@ -121,7 +121,7 @@ def read_tum(path: str | Path) -> Trajectory:
     return load_tum(path).trajectory
 
 
-def load_tum(path: str | Path) -> TumFile:
+def load_tum(path: str | Path) -> LoadedTrajectory:
     """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
 
     Raises:
@@ -254,7 +254,7 @@ def _joined(headings: list[Heading]) -> Heading | None:
 
 def ordered_file(
     ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes
-) -> TumFile:
+) -> LoadedTrajectory:
     """Poses in the order of their stamps, with the counts of sorted and replaced lines.
 
     Args:
@@ -278,7 +278,7 @@ def ordered_file(
         every_line.T_world_cam[last_of_stamp],
         exact[last_of_stamp],
     )
-    return TumFile(trajectory, notes, every_line if notes.duplicates else None)
+    return LoadedTrajectory(trajectory, notes, every_line if notes.duplicates else None)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") -> None:
@@ -435,7 +435,7 @@ def is_number(text: str) -> bool:
 
 
 def _hint(parts: list[str]) -> str:
-    """Which other format a line of another length is of; empty where that is not known."""
+    """Name the format that a line of another length is of; empty where that is not known."""
     if len(parts) == 12:
         return "12 values a line are KITTI's format: `eval` and `import` take its stamps with --timestamps FILE"
     if len(parts) in (15, 16):  # the stamp may be a whole number
@@ -451,7 +451,7 @@ def _hint(parts: list[str]) -> str:
 # numbers a line.
 
 _KITTI_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
-"""What stands in a line of KITTI's format."""
+"""Columns of a line in KITTI's format: a 3x4 matrix row by row."""
 
 
 def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
@@ -472,7 +472,7 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
     return _load_kitti(Path(path), Path(times)).trajectory
 
 
-def _load_kitti(path: Path, times: Path) -> TumFile:
+def _load_kitti(path: Path, times: Path) -> LoadedTrajectory:
     """The camera-to-world trajectory of a KITTI pose file and its stamps, with notes on both."""
     # rigid poses, whose rotations are made orthonormal
     rows = read_table(path, 12, _KITTI_COLUMNS)
@@ -489,7 +489,7 @@ def _load_kitti(path: Path, times: Path) -> TumFile:
     ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-    return TumFile(
+    return LoadedTrajectory(
         Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note)
     )
 
@@ -512,7 +512,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
 # in another file.
 
 
-def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> TumFile:
+def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> LoadedTrajectory:
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.listing import list_runs, rescore
-    from dynslam_bench.runs.many import Plan, RunEvent, requested_files, run_many
+    from dynslam_bench.runs.many import PlannedRuns, RunEvent, requested_files, run_many
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
-    from dynslam_bench.runs.rows import part_words, run_row
+    from dynslam_bench.runs.rows import make_run_row, part_words
     from dynslam_bench.runs.running import run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
     from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, open_store, score
@@ -38,11 +38,11 @@ _DEFINED_IN = {
     "read_trajectory": "exchange.formats",
     "rescore": "listing",
     "resolve": "identity",
-    "Plan": "many",
+    "PlannedRuns": "many",
     "ResolvedRun": "identity",
     "run_many": "many",
     "run_one": "running",
-    "run_row": "rows",
+    "make_run_row": "rows",
     "score": "store",
     "RunEvent": "many",
     "RunRecord": "record",
@@ -56,7 +56,7 @@ __all__ = [
     "Exported",
     "Limits",
     "MetricRecord",
-    "Plan",
+    "PlannedRuns",
     "ResolvedRun",
     "RunEvent",
     "RunRecord",
@@ -66,6 +66,7 @@ __all__ = [
     "import_trajectory",
     "list_runs",
     "load_frames",
+    "make_run_row",
     "merge",
     "open_store",
     "part_words",
@@ -75,7 +76,6 @@ __all__ = [
     "resolve",
     "run_many",
     "run_one",
-    "run_row",
     "score",
 ]
 

@@ -1,4 +1,4 @@
-"""What a run leaves beside its trajectory: snapshots of frames, the map, the sheet, the video."""
+"""Files of a run beside its trajectory: snapshots of frames, the map, the sheet, the video."""
 
 from __future__ import annotations
 
@@ -303,7 +303,7 @@ def keep_map(
 
 
 def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
-    """Which run made a map, in words."""
+    """Describe the run that made a map, in words."""
     start, stop = spec.frames_seen or (0, None)
     asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
     # tracker and sequence, then what was asked for otherwise than by default

@@ -16,7 +16,7 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.slam_env import resolve_device
 from dynslam_bench.runs.own_code import package_code
-from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
 
 _FIELDS_OF_KIND = (
@@ -30,7 +30,7 @@ _FIELDS_OF_KIND = (
     "offset",
     "stride",
 )
-"""What of a `RunSpec` decides whether a host can make it: runs that are equal in these are of one kind."""
+"""Fields of a `RunSpec` that decide whether a host can make it: runs that are equal in these are of one kind."""
 _COUNT_SLOTS_EVERY_S = 5.0
 """Seconds between two looks at the workers that there are."""
 
@@ -73,7 +73,7 @@ class DaskWorkers(Executor):
     def describe(
         self, sequences: Sequence[str], data_root: str | None = None
     ) -> list[dict[str, object]]:
-        """What each worker has, as rows of a table; one that does not know this package gets no runs.
+        """Describe each worker as a row of a table; one that does not know this package gets no runs.
 
         Args:
             sequences: Ids or folders that runs will need.
@@ -200,8 +200,9 @@ def _answer(
 def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
     """Description of this machine: code, packages and device, and which sequences and networks it lacks."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
-    if not cached_checkpoint(COCO):
-        lacking.add(f"network {COCO.id}")
+    for checkpoint in CHECKPOINTS.values():
+        if not cached_checkpoint(checkpoint):
+            lacking.add(f"network {checkpoint.id}")
     return {
         "code": package_code(),
         "packages": set(versions().items()),

@@ -18,7 +18,8 @@ from pydantic.dataclasses import dataclass as validated
 from dynslam_bench.contracts import stage_seconds
 from dynslam_bench.core import DynslamError, RunError, read_lines, reason_of, storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
-from dynslam_bench.runs.layout import ONLINE
+from dynslam_bench.geometry.motion_covariances import MotionCovariances, write_motion_covariances
+from dynslam_bench.runs.layout import COVARIANCES, ONLINE
 from dynslam_bench.runs.record import RunRecord, StageTime
 from dynslam_bench.runs.store import RunStore
 
@@ -78,6 +79,8 @@ class FrameRow:
             ``ok``. Not in ``frames.csv``: ``trajectory_online.txt`` holds it.
         dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None
             without such masks.
+        motion_covariance: Covariance of the motion to this frame, 36 numbers row by row; None where
+            the tracker gave none. Not in ``frames.csv``: ``motion_covariances.txt`` holds it.
     """
 
     index: Annotated[int, Field(ge=0, lt=MOST_FRAMES)]
@@ -93,6 +96,7 @@ class FrameRow:
     stats: dict[str, float] = field(default_factory=dict)
     pose: list[float] | None = None
     dynamic_share: float | None = None
+    motion_covariance: Annotated[list[float], Field(min_length=36, max_length=36)] | None = None
 
     @field_validator("pose")
     @classmethod
@@ -114,6 +118,7 @@ class FrameRow:
         # errors are missing without ground truth, the pose on a lost frame
         error = outcome.error
         pose = outcome.T_world_cam
+        covariance = outcome.motion_covariance
         return cls(
             index=outcome.index,
             timestamp=outcome.timestamp,
@@ -128,6 +133,7 @@ class FrameRow:
             stats=storable(dict(outcome.stats)),
             pose=None if pose is None else np.concatenate(se3.to_quaternion(pose)).tolist(),
             dynamic_share=dynamic_share,
+            motion_covariance=None if covariance is None else covariance.ravel().tolist(),
         )
 
     def cells(self) -> dict[str, Any]:
@@ -251,6 +257,13 @@ class FrameLog:
         poses = np.array([pose for _, pose in tracked], dtype=np.float64)  # position, quaternion
         return Trajectory(stamps, se3.from_quaternion(poses[:, :3], poses[:, 3:]))
 
+    def motion_covariances(self) -> MotionCovariances:
+        """The covariances of the motions to tracked frames, as the tracker gave them."""
+        rows = [row for row in self.rows if row.motion_covariance is not None]
+        stamps = np.array([row.timestamp for row in rows], dtype=np.float64)
+        numbers = np.array([row.motion_covariance for row in rows], dtype=np.float64)
+        return MotionCovariances(stamps, numbers.reshape(-1, 6, 6))
+
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
         timings = {}
@@ -288,7 +301,7 @@ class FrameLog:
         return count
 
     def write(self, folder: Path, comment: str, exact: Mapping[float, int] | None = None) -> None:
-        """Write `frames.csv` and `trajectory_online.txt`.
+        """Write `frames.csv`, `trajectory_online.txt` and, where there are any, `motion_covariances.txt`.
 
         Args:
             folder: The folder.
@@ -298,6 +311,9 @@ class FrameLog:
         """
         write_tum(folder / ONLINE, self.trajectory().with_exact(exact or {}), comment=comment)
         write_csv(folder / CSV_FILE, self.rows, exact)
+        covariances = self.motion_covariances()
+        if len(covariances):
+            write_motion_covariances(folder / COVARIANCES, covariances)
 
 
 _COLUMN_TYPES = {"index": "int64", "timestamp": "float64", "state": "string", "reward_m": "float64"}

@@ -1,4 +1,4 @@
-"""What makes two runs the same run: what was asked for, and what was read for it.
+"""Identity of a run: what was asked for, and what was read for it.
 
 A run's id has twelve digits of what was asked for and eight of what was read. A stored run is taken
 again while all that was read for it is unchanged.
@@ -54,6 +54,7 @@ from dynslam_bench.runs.record import (
 )
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.view import SequencePart, reader_of, sequence_part_of
@@ -111,7 +112,7 @@ class ResolvedRun:
 
     @cached_property
     def run_id(self) -> str:
-        """Its id; that of a run with plug-ins or programs changes when it is known what they read."""
+        """Id of the run; that of a run with plug-ins or programs changes when it is known what they read."""
         return digest_of_request(self.identity) + self.read_digest
 
     @cached_property
@@ -294,7 +295,7 @@ class Resolver:
     def _named_files(
         self, configured: _Configuration, source: str
     ) -> tuple[dict[str, Any], tuple[Path, ...]]:
-        """What `_files_of` gives, looked up once for a tracker with its settings and a source of masks."""
+        """Look up the result of `_files_of` once for a tracker with its settings and a source of masks."""
         key = (configured.key, source)
         if key not in self._files:
             self._files[key] = _files_of(configured.tracker, configured.settings, source)
@@ -303,7 +304,7 @@ class Resolver:
     def _named_components(
         self, configured: _Configuration, source: str, sequence: Sequence, *, changes_frames: bool
     ) -> tuple[list[str], BaseFolders]:
-        """What a run is made of, by the names of its identity, and where the names of files begin.
+        """Components of a run by the names of its identity, and the folders in which the names of files begin.
 
         Looked up once for a tracker with its settings, a source of masks and a kind of sequence;
         see `components_of_run`.
@@ -412,7 +413,7 @@ def _files_of(
     """
     weights = named_digests(settings, words=is_outside_package(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
-    if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
+    if source in ("embedded", *CHECKPOINTS) and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
     named: dict[str, Any] = {"weights": weights}
     if not tracker.files:
@@ -423,7 +424,7 @@ def _files_of(
 
 
 def libraries() -> dict[str, str]:
-    """What computes with a run's data: versions of the modules that are imported, and what comes before them."""
+    """Versions of the modules that compute with a run's data, and the paths that are searched before them."""
     imports = ImportPath(sys.path)
     identities = {name: library_identity(module, imports) for name, module in LIBRARIES.items()}
     return identities | search_path()

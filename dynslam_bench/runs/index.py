@@ -1,4 +1,4 @@
-"""What was computed from the runs of a store, in one SQLite file that may be deleted at any time."""
+"""Index of what was computed from the runs of a store, in one SQLite file that may be deleted at any time."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from dynslam_bench.core import RunError
 from dynslam_bench.runs.layout import (
+    COVARIANCES,
     FINAL,
     INDEX_FILE,
     ONLINE,
@@ -34,7 +35,7 @@ _LOCKED_S = 10.0
 
 
 class RunIndex:
-    """What was computed from the runs of a store: metrics, rows of lists and rows of reports, in one SQLite file.
+    """Values computed from the runs of a store: metrics, rows of lists and rows of reports, in one SQLite file.
 
     Each value holds for one version of the code that computed it and for one state (times and
     sizes) of the files that it was computed from. The file may be deleted at any time; values that
@@ -66,6 +67,7 @@ class RunIndex:
         files = (
             f"{run}/{ONLINE}",
             f"{run}/{FINAL}",
+            f"{run}/{COVARIANCES}",
             f"{sequence}/{TRUTH}",
             f"{sequence}/{STAMPS}",
         )
@@ -183,7 +185,7 @@ class RunIndex:
         )
 
     def _is_plain(self, run_id: str, state: str) -> bool:
-        """Whether the folders of a run and of its sequence's part hold plain files alone."""
+        """Whether the folders of a run and of its sequence's part hold plain files alone, no links or pipes."""
         part = state.partition(" ")[0]
         try:
             check_plain(self.root / "runs" / run_id, self.root)

@@ -1,4 +1,4 @@
-"""Where the files of a store lie, and checks of what lies there."""
+"""Layout of the files of a store, and checks of them."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ ONLINE = "trajectory_online.txt"
 """Holds the pose of each tracked frame as it was when the frame came."""
 FINAL = "trajectory_final.txt"
 """Holds the poses after the final optimisation."""
+COVARIANCES = "motion_covariances.txt"
+"""Holds the covariance of the motion to each tracked frame, of trackers that give them."""
 STAMPS = "timestamps.txt"
 """Holds the stamps of the input frames of a sequence's part."""
 TRUTH = "groundtruth.txt"

@@ -11,7 +11,7 @@ from dynslam_bench.core.module_graph import PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import PROTOCOLS, Protocol, get_protocol
 from dynslam_bench.runs.layout import Unreadable
-from dynslam_bench.runs.rows import FIELDS, Row, run_row
+from dynslam_bench.runs.rows import FIELDS, Row, make_run_row
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, Records, RunStore, metrics_name
 
 OnProgress = Callable[[int, int], None]
@@ -26,7 +26,7 @@ def list_runs(
     *,
     on_progress: OnProgress = lambda done, total: None,
 ) -> tuple[list[Row], list[Unreadable]]:
-    """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
+    """Every run as `make_run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
 
     Rows are taken from the store's index while the files of their run are the same; a store that
     cannot be written is read without it.
@@ -58,7 +58,7 @@ def list_runs(
         try:
             record, state = store.read_with_state(run_id)
             metrics = None if record.status == "stopped" else store.score(record, protocol)
-            rows[run_id] = run_row(record, metrics)
+            rows[run_id] = make_run_row(record, metrics)
             entries.append((run_id, state, json.dumps(list(rows[run_id].values()))))
         except DynslamError as error:
             unreadable.append(Unreadable(store.shown_folder(run_id), str(error)))

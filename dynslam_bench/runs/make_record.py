@@ -45,7 +45,7 @@ _FIELDS_OF_SPEC = (
     "drop_share",
     "study",
 )
-"""What a record takes from the request as it is."""
+"""Fields that a record copies from the request."""
 _FIELDS_OF_TRACKER = (
     "id",
     "version",
@@ -58,14 +58,14 @@ _FIELDS_OF_TRACKER = (
     "sensors",
     "online",
 )
-"""What a record takes from the tracker's spec as it is."""
+"""Fields that a record copies from the tracker's spec."""
 _FIELDS_OF_LAST_MESSAGE = ("keyframes", "map_points", "maps", "finalize_s")
-"""What a record takes from the last message of the run's process as it is; None where it does not say."""
+"""Fields that a record copies from the last message of the run's process; None where the message lacks them."""
 
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames of a run were tracked, and how many were not.
+    """Number of frames of a run that were tracked, and that were not.
 
     Attributes:
         total: All frames of the run's part of the sequence.
@@ -257,7 +257,7 @@ def _overrides(run: ResolvedRun, settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _notes(run: ResolvedRun) -> list[str]:
-    """What a reader of the record should know of a run beforehand, a line each."""
+    """Notes on a run for readers of its record, one a line."""
     notes = []
     if run.spec.cache:
         notes.append(_CACHED_TIMES_NOTE)
@@ -269,12 +269,12 @@ def _notes(run: ResolvedRun) -> list[str]:
 
 
 def recording_notes(sequence: Sequence) -> list[str]:
-    """What of a recording was not used, or what nobody could mean, a line each; see `RecordedSequence.remarks`."""
+    """Notes on a recording, one a line: parts not used, absurd values; see `RecordedSequence.remarks`."""
     return [f"{ON_RECORDING}{remark}" for remark in getattr(sequence, "remarks", ())]
 
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:
-    """Where a tracker is found that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
+    """Place of a tracker that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
     folder = run.base_folders.plugin
     return {
         "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,
@@ -283,7 +283,7 @@ def tracker_location(run: ResolvedRun) -> dict[str, str]:
 
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
-    """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
+    """Facts that a record keeps of a sequence, cut to its part without `offset` leading frames."""
     input_part = sequence_part_of(sequence, offset)
     stamps = sequence.timestamps
     return SequenceInfo(
@@ -305,7 +305,7 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
 
 
 def sequence_part_digest(identity: dict[str, Any]) -> str:
-    """Names what of the sequence a run saw: content and frames."""
+    """Digest of the part of a sequence that a run saw: content and frames."""
     return digest(
         {key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16
     )

@@ -75,7 +75,7 @@ class RunEvent:
 
 
 @dataclass
-class Plan:
+class PlannedRuns:
     """Runs and frames that a call of `run_many` is to make.
 
     Attributes:
@@ -94,7 +94,7 @@ def run_many(
     jobs: int = 1,
     executor: Executor | None = None,
     retry: Collection[str] = (),
-    on_plan: Callable[[Plan], None] | None = None,
+    on_plan: Callable[[PlannedRuns], None] | None = None,
     on_event: Callable[[RunEvent], None] | None = None,
     on_progress: OnProgress | None = None,
     protocol: Protocol | str = DEFAULT_PROTOCOL,
@@ -136,6 +136,7 @@ def run_many(
         DynslamError: The results folder cannot be written, what runs need broke, a network has to
             be fetched first, or, without `on_fault`, a run cannot be made.
     """
+    # statuses of stored runs that are made again
     store = results if isinstance(results, RunStore) else RunStore(results)
     retried = set(retry)
     if "failed" in retried:
@@ -147,6 +148,8 @@ def run_many(
         )
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
+
+    # take what is stored, and make the others here or on the executor
     runs = _ManyRuns(
         store, get_protocol(protocol), jobs, on_plan, on_event, on_progress, cancelled, on_fault
     )
@@ -155,6 +158,8 @@ def run_many(
         runs.make_here()
     else:
         runs.make_remotely(executor)
+
+    # faults, then the records in the order of the specs
     if runs.first_fault is not None and on_fault is None:
         raise runs.first_fault
     finished = [runs.done[run_id] for run_id in runs.run_ids if run_id in runs.done]
@@ -168,7 +173,7 @@ class _ManyRuns:
     store: RunStore
     protocol: Protocol
     jobs: int
-    on_plan: Callable[[Plan], None] | None
+    on_plan: Callable[[PlannedRuns], None] | None
     on_event: Callable[[RunEvent], None] | None
     on_progress: OnProgress | None
     cancelled: Callable[[], bool]
@@ -193,9 +198,10 @@ class _ManyRuns:
         """
         resolver = Resolver()
         stored_runs = LookUp(self.store)
-        plan = Plan()
+        plan = PlannedRuns()
         looked_up: set[str] = set()
         for spec in specs:
+            # the run of a spec; equal ones are made once
             run = self._resolve(resolver, spec)
             if run is None:
                 continue
@@ -205,6 +211,7 @@ class _ManyRuns:
             if run.run_id in looked_up:
                 continue
             looked_up.add(run.run_id)
+            # taken as it is stored, or to be made
             stored = stored_runs.find(run)
             if stored is not None and self._is_usable(run, stored, retried):
                 self._reuse(run, stored)
@@ -382,7 +389,7 @@ class _ManyRuns:
 
 
 def _answer_of(ask: Callable[..., T], *arguments: object) -> T:
-    """What an executor answers; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
+    """Call an executor; its own end, as when Dask's scheduler is killed, is no outcome of a run."""
     try:
         return ask(*arguments)
     except DynslamError:

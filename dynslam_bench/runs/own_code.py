@@ -1,4 +1,4 @@
-"""Which modules of this package decide the result of a run: those that its components import.
+"""Modules of this package that decide the result of a run: those that its components import.
 
 The components are the tracker's entry point, its filters, features, flow and segmenter, the reader or
 renderer of the sequence, and the environment with the run's loop. A change of any other module
@@ -44,7 +44,7 @@ RESULT_NEUTRAL_MODULES = (
     "segmentation.build_segmenter",
     "sequences.decoded",
 )
-"""What the environment and the loop use to draw and to store; masks count with the systems that have them."""
+"""Modules that the environment and the loop draw and store with; masks count with the systems that have them."""
 PACKAGES_FOR_PLUGINS = (
     "contracts",
     "core",
@@ -76,7 +76,7 @@ def components_of_run(
     *,
     changes_frames: bool,
 ) -> list[str]:
-    """What a run is made of beside the environment: entry points, and modules of the sequence, sorted.
+    """Components of a run beside the environment: entry points, and modules of the sequence, sorted.
 
     An identity stores them as ``parts``.
 

@@ -32,7 +32,7 @@ _PACKED_NAME = re.compile(
 
 
 def expected_identity(run: ResolvedRun) -> dict[str, Any]:
-    """What a worker has to find where it looks a run up: its identity, and the same files of plug-ins.
+    """The identity that a worker has to find where it looks a run up, with the digests of the plug-ins' files.
 
     A plug-in's file counts in the identity as it is read, which is after the run.
     """

@@ -1,4 +1,4 @@
-"""What is kept of a run: `run.json`, which `store` writes, and the metrics, which lie apart in the index."""
+"""Records of runs: `run.json`, which `store` writes, and the metrics, which lie apart in the index."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ON_RECORDING = "recording: "
 """Begins a run's notes on what of its recording was not used, or what nobody could mean."""
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-"""How a run ended, see `RunRecord`."""
+"""Status of a run that ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 ASKED = (
@@ -41,11 +41,11 @@ ASKED = (
     "drop_share",
     "degrade",
 )
-"""What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
+"""Entries of an identity that were asked for; all others were read: code, data, weights, libraries, files."""
 _CODE_ENTRIES = ("tracker_version", "source", "requires", "files", "reads")
-"""What of an identity says by which code the run was made."""
+"""Entries of an identity that tell the code that made the run."""
 PROGRAM = ("parts", *_CODE_ENTRIES, "libraries", "weights")
-"""What of an identity says by which program the run was made: its code, libraries and weights."""
+"""Entries of an identity that tell the program that made the run: its code, libraries and weights."""
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5
@@ -71,9 +71,11 @@ def run_id_of(identity: Mapping[str, Any]) -> str:
     return digest_of_request(identity) + digest_of_reads(identity)
 
 
-def coverage_text(coverage: float | None) -> str:
-    """The share of tracked frames for people."""
-    return "unknown" if coverage is None else f"{100 * coverage:.1f} %"
+def coverage_text(coverage: float | None, truth_share: float | None = None) -> str:
+    """The share of tracked frames for people; where the frames are not known, that of the ground truth's time."""
+    if coverage is not None:
+        return f"{100 * coverage:.1f} %"
+    return "unknown" if truth_share is None else f"{100 * truth_share:.0f} % of the truth's time"
 
 
 def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
@@ -219,6 +221,8 @@ class RunRecord(Record):
         n_dropped: Frames that never reached the tracker.
         coverage: ``n_tracked / n_frames``; None where the frames are not known, see
             `import_trajectory`.
+        truth_share: Share of the ground truth's time that an imported trajectory has poses for,
+            where its frames are not known; else None.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
         maps: Maps at the end that never met, those of their own begun after a loss among them; None
@@ -277,6 +281,7 @@ class RunRecord(Record):
     n_initialising: int = 0
     n_dropped: int = 0
     coverage: float | None = Field(default=0.0, ge=0, le=1)
+    truth_share: float | None = Field(default=None, ge=0, le=1)
     keyframes: int | None = None
     map_points: int | None = None
     maps: int | None = None
@@ -307,7 +312,7 @@ class RunRecord(Record):
 
     @property
     def reads(self) -> Reads | None:
-        """What the plug-ins and programs of the run read; None for a run without such, or where it is not known."""
+        """Digests of what the run's plug-ins and programs read; None for a run without such, or if not known."""
         stored = self.identity.get("reads")
         return None if stored is None else Reads.model_validate(stored)
 
@@ -318,7 +323,7 @@ class RunRecord(Record):
 
     @property
     def program(self) -> dict[str, str]:
-        """What made the run beside its settings: code, weights and library versions, by name, as short texts."""
+        """Code, weights and library versions that made the run, by name, as short texts."""
         made = program_of(self.identity) if self.kind == "run" else {}
         return made if self.verified else made | {"identity": "unverified"}
 
@@ -331,6 +336,14 @@ class RunRecord(Record):
     def incomplete(self) -> bool:
         """Whether it is known that frames have no pose."""
         return self.coverage is not None and self.coverage < 1
+
+    @property
+    def poses_words(self) -> str:
+        """How much of the sequence has a pose: frames of all, or poses and time where the frames are not known."""
+        if self.coverage is not None:
+            return f"{self.n_tracked} of {self.n_frames} frames"
+        share = coverage_text(None, self.truth_share)
+        return f"{self.n_tracked} poses, {share}; the number of frames is not known"
 
     def public(self) -> RunRecord:
         """The record for others: without the command line and the folders of the machine that made it.
@@ -369,7 +382,7 @@ class RunRecord(Record):
 
     @property
     def repeat(self) -> str:
-        """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
+        """Name of the repeat of its block that the run is, e.g. ``seed 0, offset 2``."""
         words = [f"seed {self.seed}"]
         if self.offset:
             words.append(f"offset {self.offset}")
@@ -396,7 +409,7 @@ class RunRecord(Record):
         parts = [
             f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"
         ]
-        parts.append(f"coverage {coverage_text(self.coverage)}")
+        parts.append(f"coverage {coverage_text(self.coverage, self.truth_share)}")
         if self.frame_time_s is not None:
             parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
         return ", ".join(parts) + (f" ({self.reason})" if self.reason else "")
@@ -437,7 +450,7 @@ class MetricRecord(Record):
 
     @property
     def remarks(self) -> list[str]:
-        """What to know before the numbers are believed, a line each: warnings on the primary evaluation, and hints."""
+        """Warnings on the primary evaluation, then hints, one a line."""
         warnings = [] if self.primary is None else self.primary.warnings
         return [
             *(f"warning: {line}" for line in warnings),

@@ -33,7 +33,7 @@ from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
 
 CHILD_ENTRY_POINT = "dynslam_bench.runs.loop:run_loop"
-"""What the child process does; `process.child` imports and calls it."""
+"""The function of the child process; `process.child` imports and calls it."""
 PROGRESS_EVERY = 50
 """Frames between two reports of partial metrics."""
 OnProgress = Callable[[str, dict[str, Any]], bool]
@@ -178,7 +178,7 @@ def _write_frames(run: ResolvedRun, work_folder: Path) -> FrameLog:
 
 
 def recording_options(run: ResolvedRun) -> dict[str, Any] | None:
-    """What the child needs to know to record what plug-ins and programs read; None for a run without such."""
+    """Options with which the child records what plug-ins and programs read; None for a run without such."""
     if not run.has_plugins_or_programs:
         return None
     plugin = None if run.base_folders.plugin is None else str(run.base_folders.plugin)
@@ -186,7 +186,7 @@ def recording_options(run: ResolvedRun) -> dict[str, Any] | None:
 
 
 def read_reads(work_folder: Path) -> Reads | None:
-    """What the child has recorded, which is taken out of the run's folder; None where it was killed before."""
+    """Take the record of what the child read out of the run's folder; None where the child was killed before."""
     file = work_folder / READS_FILE
     if not file.is_file():
         return None
@@ -196,7 +196,7 @@ def read_reads(work_folder: Path) -> Reads | None:
 
 
 def _watched(work_folder: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
-    """How a run ended; when its fork server dies, the run is repeated with a fork server of its own.
+    """Run in a child process until it ends; when its fork server dies, run it again with a fork server of its own.
 
     No other run is there then. If that server dies, too, it is this run that has killed it: the run
     has crashed.

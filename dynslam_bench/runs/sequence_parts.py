@@ -1,4 +1,4 @@
-"""What a store keeps of the sequences: stamps and ground truth of each part, by which runs are scored again.
+"""Parts of sequences that a store keeps: stamps and ground truth of each part, by which runs are scored again.
 
 The images are not needed for that.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core import RunError, read_lines, translate_errors, write_atomic
-from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum
+from dynslam_bench.geometry import LoadedTrajectory, Trajectory, format_ns, format_tum, load_tum
 from dynslam_bench.runs.layout import (
     STAMPS,
     TRUTH,
@@ -94,7 +94,7 @@ class SequenceParts:
 
 
 @lru_cache(maxsize=64)
-def _read_truth(path: Path, _stamp: str) -> TumFile:
+def _read_truth(path: Path, _stamp: str) -> LoadedTrajectory:
     """A ground truth; its arrays are read-only."""
     file = load_tum(path)
     for truth in (file.trajectory, file.poses(repeats=True)):

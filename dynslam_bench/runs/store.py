@@ -39,9 +39,15 @@ from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, has_imported_plugins
 from dynslam_bench.core.reads import remembered
 from dynslam_bench.evaluation import Evaluation, Protocol, evaluate, get_protocol, hints
+from dynslam_bench.evaluation.uncertainty import truth_noise
 from dynslam_bench.geometry import Trajectory, read_tum
+from dynslam_bench.geometry.motion_covariances import (
+    MotionCovariances,
+    read_motion_covariances,
+)
 from dynslam_bench.runs.index import RunIndex
 from dynslam_bench.runs.layout import (
+    COVARIANCES,
     FINAL,
     ONLINE,
     REMOVED_HINT,
@@ -197,7 +203,7 @@ class RunStore:
         """
         sequence = self.sequences.folder(part)
         checksums = {}
-        for folder, names in ((run, (ONLINE, FINAL)), (sequence, (TRUTH, STAMPS))):
+        for folder, names in ((run, (ONLINE, FINAL, COVARIANCES)), (sequence, (TRUTH, STAMPS))):
             for name in names:
                 path = f"{folder}/{name}"
                 if not os.path.isfile(path):  # noqa: PTH113 - of thousands of runs, as `file_stamp`
@@ -274,7 +280,7 @@ class RunStore:
             RunError: One is missing or another one.
         """
         copied = self._checksums(record.sequence.part, work)
-        for name in (ONLINE, FINAL):
+        for name in (ONLINE, FINAL, COVARIANCES):
             if copied.get(name) != record.files.get(name, copied.get(name)):
                 raise RunError(
                     f"{name} of run {record.run_id} was removed or changed while it was copied"
@@ -509,7 +515,14 @@ class RunStore:
         for which in evaluations:
             try:
                 trajectory, truth, stamps = self._inputs(record, protocol, which)
-                evaluations[which] = evaluate(trajectory, truth, protocol, input_timestamps=stamps)
+                evaluations[which] = evaluate(
+                    trajectory,
+                    truth,
+                    protocol,
+                    input_timestamps=stamps,
+                    motion_covariances=self._covariances(record, which),
+                    truth_noise=truth_noise(record.sequence.id),
+                )
             except DynslamError as error:
                 reasons[which] = str(error)
                 continue
@@ -526,6 +539,17 @@ class RunStore:
             reasons=reasons,
             hints=hint_lines,
         )
+
+    def _covariances(self, record: RunRecord, which: TrajectoryKind) -> MotionCovariances | None:
+        """The covariances that a tracker gave with its online poses; None where it gave none.
+
+        Raises:
+            DynslamError: Their file is damaged.
+        """
+        path = self.folder(record.run_id) / COVARIANCES
+        if which != "online" or not path.is_file():
+            return None
+        return read_motion_covariances(path)
 
     def _scored_trajectory(self, record: RunRecord, protocol: Protocol) -> TrajectoryKind:
         """The trajectory that the protocol asks for, or the only one that a run has."""
@@ -578,6 +602,7 @@ class RunStore:
         reasons = [f"{entry.path}: {entry.reason}" for entry in unreadable]
 
         def scored() -> Iterator[tuple[RunRecord, MetricRecord | None]]:
+            """Each readable run with its metrics; those that cannot be read give a reason."""
             for run_id in records.run_ids:
                 try:
                     record = self.read_whole(run_id)

@@ -15,16 +15,17 @@ from dynslam_bench.runs.identity import libraries, source_digests
 from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
+from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.trackers.registry import TRACKERS
 
 NOT_RECORDED = "its record does not say what it was made by"
-_NETWORKS = ("embedded", "coco")
+_NETWORKS = ("embedded", *CHECKPOINTS)
 """Weights that no setting names, see `build_segmenter.weights_digest`."""
 
 
 class Installation:
-    """What is installed here; each thing is looked at once, however many runs are compared with it.
+    """The installed programs; each thing is looked at once, however many runs are compared with it.
 
     No plug-in is imported. A run's data are no part of the comparison: runs on other data are other
     columns of a table.
@@ -36,7 +37,7 @@ class Installation:
         self._answers: dict[str, str] = {}
 
     def what_changed(self, record: RunRecord) -> str:
-        """What of a run's program is another one here, in a few words; empty where the program is the one installed.
+        """Name what differs between a run's program and the installed one, in a few words; empty where nothing does.
 
         Imported trajectories have no program that could change.
         """
@@ -74,36 +75,42 @@ class Installation:
                 setting names.
             plugin: The folder of its plug-in's file.
         """
+        # what the run recorded of its program
         parts = program.get("parts")
         if not isinstance(parts, list) or not isinstance(program.get("source"), dict):
             return NOT_RECORDED
         parts = [str(part) for part in parts]
 
+        # this package's code
         code = _difference(program["source"], source_digests(parts))
         if code is not None:
             return f"the code of {module_of(code)}"
 
+        # libraries that every run computes with
         if self._libraries is None:
             self._libraries = libraries()
         library = _difference(program.get("libraries"), self._libraries)
         if library is not None:
             return library
 
+        # packages that the tracker needs
         required = _table(program.get("requires"))
         package = _difference(required, {module: _package_now(module) for module in required})
         if package is not None:
             return f"the package {package}"
 
+        # weights of its networks
         weights = _table(program.get("weights"))
         file = _difference(weights, {name: _weights_now(name, named[name]) for name in weights})
         if file is not None:
             return f"the weights of {file}"
 
+        # files of plug-ins and programs
         runs_foreign_code = "files" in program or any(map(is_outside_package, parts))
         return self._what_was_read(program, plugin) if runs_foreign_code else ""
 
     def _what_was_read(self, program: Mapping[str, Any], plugin: Path | None) -> str:
-        """What has changed of all that plug-ins and programs read."""
+        """Name what has changed of all that plug-ins and programs read."""
         try:
             reads = Reads.model_validate(program.get("reads"))
         except ValidationError:

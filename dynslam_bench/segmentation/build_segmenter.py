@@ -32,7 +32,9 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.core.stage_cache import Arrays, ReadsSoFar, StageCache, stage_code
 from dynslam_bench.segmentation.networks.checkpoints import (
+    CHECKPOINTS,
     COCO,
+    SELFIE,
     Checkpoint,
     cached_checkpoint,
     embedded_weights,
@@ -50,10 +52,11 @@ __all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
-"""Sources whose masks depend on the colour image alone."""
+"""Sources whose masks depend on the colour image alone; those of a network of maps also depend on earlier ones."""
 
 
 def _builtin() -> Iterable[SegmenterSpec]:
+    """The specs of the segmenters in this package."""
     recorded = "dynslam_bench.segmentation.recorded"
     networks = "dynslam_bench.segmentation.networks"
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
@@ -71,6 +74,17 @@ def _builtin() -> Iterable[SegmenterSpec]:
             "onnx",
             f"{networks}.onnx_segmenter:build",
             "YOLO-seg, semantic or torchvision networks (onnx:PATH)",
+        ),
+        SegmenterSpec(
+            "tflite",
+            f"{networks}.tflite_segmenter:build",
+            "networks of probability maps in TensorFlow Lite files (tflite:PATH)",
+        ),
+        SegmenterSpec(
+            "selfie",
+            f"{networks}.tflite_segmenter:build_selfie",
+            "MediaPipe's selfie segmentation: people indoors, 0.25 MB",
+            "Apache-2.0 (weights)",
         ),
         SegmenterSpec(
             "embedded",
@@ -103,7 +117,7 @@ SEGMENTERS: Registry[SegmenterSpec] = Registry("segmenters", SegmenterSpec, _bui
 class NetworkNotFetched(SegmentationError):
     """``auto`` needs a network that is not in the cache; the user is asked before it is downloaded."""
 
-    checkpoint: Checkpoint = COCO
+    checkpoint: Checkpoint = SELFIE
 
 
 def resolve_source(
@@ -113,7 +127,7 @@ def resolve_source(
     *,
     optional: bool = False,
 ) -> str:
-    """What `settings.source` means for a sequence; the label stored with results.
+    """Resolve `settings.source` for a sequence to the label that is stored with results.
 
     Args:
         settings: The settings with the source.
@@ -122,24 +136,26 @@ def resolve_source(
         optional: Whether the tracker also works without masks, for the hint.
 
     Returns:
-        ``auto`` becomes ``embedded`` or ``coco``; everything else stays as it is.
+        ``auto`` becomes ``embedded``, ``coco`` or ``selfie``; everything else stays as it is.
 
     Raises:
-        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the
+        NetworkNotFetched: ``auto`` needs a network, and none is in the cache; lists the
             alternatives.
     """
     if settings.source != "auto":
         return settings.source
 
-    # auto: the embedded network on what it was trained for, else the COCO checkpoint if it is there
+    # auto: the embedded network on what it was trained for, else the best network that is there
     if sequence_id.startswith("synthetic/"):
         return "embedded"
-    if cached_checkpoint(COCO) is not None:
-        return "coco"
+    for checkpoint in (COCO, SELFIE):
+        if cached_checkpoint(checkpoint) is not None:
+            return checkpoint.id
 
     # neither: list what the user may choose
     options = [
-        "--yes (run, bench) or segmentation.source=coco downloads it once",
+        f"--yes (run, bench) or segmentation.source=selfie downloads it once; segmentation.source=coco takes "
+        f"torchvision's ({COCO.megabytes:g} MB, {COCO.license}), which knows {len(COCO_NAMES)} classes",
         "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
         "segmentation.source=recorded:DIR takes masks that were stored before",
     ]
@@ -151,7 +167,8 @@ def resolve_source(
         options.append("without masks: a tracker such as 'emfoa-oft?masks=none' or orb-slam2")
     raise NetworkNotFetched(
         f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
-        f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
+        f"a network, and none is in the cache; '{SELFIE.id}' finds people indoors ({SELFIE.megabytes:g} MB, "
+        f"{SELFIE.license})",
         options=options,
     )
 
@@ -162,7 +179,7 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     Args:
         settings: A tracker's settings.
         sequence: The sequence it will run on.
-        fetch: Download the COCO checkpoint now if that is the source and it is not in the cache.
+        fetch: Download a published checkpoint now if it is the source and not in the cache.
 
     Returns:
         The resolved source; empty for a tracker without a semantic stage.
@@ -188,7 +205,7 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         _check_oracle(kind, group, sequence)
     elif kind == "recorded":
         _check_recorded(Path(argument), group, sequence)
-    elif kind in ("onnx", "weights"):
+    elif kind in ("onnx", "tflite", "weights"):
         path = Path(argument).expanduser()
         stat = path.stat() if path.is_file() else None
         _check_network(kind, argument, group, stat and (stat.st_size, stat.st_mtime_ns))
@@ -196,8 +213,8 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         raise SegmentationError(
             "the embedded network's weights are missing from this installation", "reinstall it"
         )
-    elif kind == "coco" and fetch:
-        fetch_checkpoint(COCO)
+    elif kind in CHECKPOINTS and fetch:
+        fetch_checkpoint(CHECKPOINTS[kind])
     elif kind == "plugin":
         SEGMENTERS.get(argument)
     return source
@@ -479,6 +496,11 @@ class ConfiguredSegmenter:
         self.also = also
         self._unknown_classes: set[str] = set()
 
+    def reset(self) -> None:
+        """Begin a new sequence: a segmenter that remembers frames forgets them."""
+        if hasattr(self.inner, "reset"):
+            self.inner.reset()
+
     def segment(self, frame: Frame) -> Instances:
         """The objects of the frame that count: see `postprocess.select`.
 
@@ -547,11 +569,11 @@ def weights_digest(
     path = None
     if kind == "embedded":
         path = embedded_weights()
-    elif kind == "coco":
-        path = cached_checkpoint(COCO)
+    elif kind in CHECKPOINTS:
+        path = cached_checkpoint(CHECKPOINTS[kind])
         if path is None:
-            return COCO.sha256_prefix
-    elif kind in ("onnx", "weights", "recorded"):
+            return CHECKPOINTS[kind].sha256_prefix[:12]
+    elif kind in ("onnx", "tflite", "weights", "recorded"):
         path = Path(argument).expanduser()
     with translate_errors(SegmentationError, f"cannot read {path}"):
         return path_digest(path)[:12] if path is not None and path.exists() else ""

@@ -264,14 +264,17 @@ def _coco_classes(value: Any) -> str:
 
 ClassList = Annotated[str, BeforeValidator(_coco_classes)]
 """Comma-separated COCO names or presets, validated; a list of names is taken as well."""
-PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco")
+PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco", "selfie")
 """Sources that are named alone."""
-PREFIXED_SOURCES = ("onnx", "recorded", "weights", "plugin")
+PREFIXED_SOURCES = ("onnx", "tflite", "recorded", "weights", "plugin")
 """Sources that are named with a path or an id behind a colon."""
-COCO_SOURCES = ("auto", "none", "embedded", "coco")
+COCO_SOURCES = ("auto", "none", "embedded", "coco", "selfie")
 """Sources whose classes are COCO's; the others may bring names of their own."""
 # all forms of a source, for errors
-FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
+FORMS = (
+    "auto, none, oracle, oracle-classes, embedded, coco, selfie, onnx:PATH, tflite:PATH, recorded:DIR, "
+    "weights:PATH, plugin:ID"
+)
 NMS_IOU = 0.5
 """Overlap of two boxes of one class above which the weaker one is dropped: torchvision's and YOLO's value."""
 MAX_CARRY = 10
@@ -292,9 +295,10 @@ class SegmentationSettings(Settings):
     """
 
     source: str = "auto"
-    """Where masks come from: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
-    fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
-    (exact masks of the classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``,
+    """Source of masks: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
+    was fetched, in this order), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
+    (exact masks of the classes alone), ``embedded``, ``coco``, ``selfie`` (MediaPipe's small
+    network of people indoors), ``onnx:PATH``, ``tflite:PATH`` (probability maps), ``recorded:DIR``,
     ``weights:PATH`` (a Mask R-CNN checkpoint:
     torchvision's or this project's) or ``plugin:ID``."""
     classes: str = Field(
@@ -315,6 +319,20 @@ class SegmentationSettings(Settings):
         high=0.8,
         limits=(0.01, 0.99),
         meaning="probability above which a pixel belongs to a mask",
+    )
+    map_threshold: float = tunable(
+        0.2,
+        low=0.1,
+        high=0.6,
+        limits=(0.01, 0.99),
+        meaning="networks of probability maps (selfie, tflite): probability above which a pixel is masked",
+    )
+    map_decay: float = tunable(
+        0.3,
+        low=0.0,
+        high=0.9,
+        limits=(0.0, 1.0),
+        meaning="networks of probability maps: weight of the frame before's map, carried by flow; 0 = off",
     )
     dilation_px: int = tunable(
         15,
@@ -417,11 +435,19 @@ class SegmentationSettings(Settings):
     @property
     def unused(self) -> Mapping[str, str]:
         """Tunable fields without effect: exact masks have no scores, recorded masks no probabilities."""
+        maps = ("map_threshold", "map_decay")
         fields: dict[str, tuple[str, ...]] = {
             "none": tuple(type(self).model_fields.keys() - {"source"}),
-            "oracle": ("confidence", "mask_threshold"),
-            "oracle-classes": ("confidence", "mask_threshold"),
-            "recorded": ("mask_threshold",),
+            "oracle": ("confidence", "mask_threshold", *maps),
+            "oracle-classes": ("confidence", "mask_threshold", *maps),
+            "recorded": ("mask_threshold", *maps),
+            "embedded": maps,
+            "coco": maps,
+            "onnx": maps,
+            "weights": maps,
+            "plugin": maps,
+            "selfie": ("mask_threshold",),
+            "tflite": ("mask_threshold",),
         }
         kind = self.source.partition(":")[0]
         return dict.fromkeys(fields.get(kind, ()), f"segmentation.source is {self.source!r}")

@@ -1,4 +1,4 @@
-"""Which scenes the embedded network was trained on. It lies apart from the networks, which need no renderer."""
+"""Scenes that the embedded network was trained on. The list lies apart from the networks, which need no renderer."""
 
 from dynslam_bench.core import SequenceError
 from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id

@@ -1,4 +1,4 @@
-"""What is often not known of an RGB-D camera, measured in a recording: readout time, delay of depth, depth factor.
+"""Calibration of an RGB-D camera from a recording: readout time, delay of depth, depth factor.
 
 Keypoints are tracked through windows of consecutive frames, and each window is adjusted as a bundle
 whose camera moves continuously. Every pixel belongs to the pose at its row's time, every depth to

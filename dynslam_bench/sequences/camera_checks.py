@@ -70,7 +70,7 @@ class _Fits:
 def camera_findings(
     motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: list[RgbdPair]
 ) -> list[Finding]:
-    """What does not fit a truth whose rotations are the camera's: units, positions' axes, camera, lever arm and depth.
+    """Findings on a truth whose rotations are the camera's: units, positions' axes, camera, lever arm and depth.
 
     Args:
         motions: Measured motions.

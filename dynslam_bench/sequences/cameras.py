@@ -508,7 +508,7 @@ def check_camera(camera: Camera, where: str) -> None:
 
 
 def _faults(camera: Camera) -> Iterator[str]:
-    """What is wrong with a camera, one phrase each; later ones take for granted that earlier ones are none."""
+    """Faults of a camera, one phrase each; later ones take for granted that earlier ones are none."""
     if len(camera.distortion) != len(_COEFFICIENTS):
         yield f"distortion has {len(camera.distortion)} coefficients, expected {', '.join(_COEFFICIENTS)}"
 

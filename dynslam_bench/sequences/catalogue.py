@@ -105,7 +105,7 @@ class CatalogueEntry(Settings):
         return self.id.partition("/")[0]
 
     def folders(self, data_root: Path) -> tuple[Path, ...]:
-        """Where the sequence may lie below a data root, the place `fetch` puts it first."""
+        """Folders below a data root where the sequence may lie, the place `fetch` puts it first."""
         inside = data_root / self.dataset
         if not self.distinctive:
             return inside / self.folder, data_root / self.id
@@ -122,7 +122,7 @@ class CatalogueEntry(Settings):
         return None
 
     def how_to_get(self) -> str:
-        """What a user does to have it, for the end of a message."""
+        """Tell how to get the sequence, for the end of a message."""
         if self.by_hand:
             return f"get it by hand from {self.page} ({self.by_hand}) and put it there"
         return f"fetch it with: dynslam-bench sequences fetch {self.id}"
@@ -455,7 +455,7 @@ def _blank_summary(spec: DatasetSpec, name: str) -> dict[str, Any]:
 
 
 def _public_summary(entry: CatalogueEntry, data_root: Path) -> dict[str, Any]:
-    """What the catalogue says in the row of a public sequence."""
+    """Row of a public sequence in the list of the catalogue."""
     stated = {"tags", "split", "ground_truth", "license", "url", "by_hand"}
     return entry.model_dump(include=stated) | {
         "here": entry.find(data_root) is not None,
@@ -512,7 +512,7 @@ def describe(
 
 
 def _public_facts(entry: CatalogueEntry) -> dict[str, Any]:
-    """What the catalogue says of a sequence, for people."""
+    """Facts that the catalogue holds on a public sequence, for people."""
     if entry.sha256:
         checksum = "known: another archive is refused"
     else:

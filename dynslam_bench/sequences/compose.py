@@ -42,7 +42,7 @@ _SQUARE = np.ones((3, 3), np.uint8)
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
 """Neighbourhood for holes, and for the uncertain band along an outline."""
 _LEAST_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
-"""What is seen of a person and is smaller is left out: points that were drawn without neighbours."""
+"""Smallest disc of a person that is kept: smaller ones are points that were drawn without neighbours."""
 _SHIFT_PX = 1.5
 """Images of a fixed camera shift by less against each other, by the median."""
 
@@ -299,7 +299,7 @@ class Cutouts:
         return frame.rgb, self._depth(frame, mask), mask
 
     def _nearer(self, frame: Frame) -> NDArray[np.bool_]:
-        """Where a frame is nearer than the background ``[H, W]``."""
+        """Pixels ``[H, W]`` in which a frame is nearer than the background."""
         least = np.maximum(_NEARER_M, _NEARER_SHARE * self._background)
         return np.asarray((frame.depth > 0) & (frame.depth < self._background - least))
 

@@ -103,7 +103,7 @@ def _read(path: Path) -> NDArray[np.void] | None:
 
 
 def _record(sequence: Sequence) -> np.dtype[np.void]:
-    """What is stored of a frame."""
+    """Data type of a stored frame: its colour and depth image."""
     size = (sequence.camera.height, sequence.camera.width)
     return np.dtype([("rgb", np.uint8, (*size, 3)), ("depth", np.float32, size)], align=True)
 

@@ -45,7 +45,7 @@ STRETCH = 40
 
 Progress = Callable[[int, int], None]
 _UNREADABLE = (DynslamError, OSError, ValueError)
-"""What a recording raises that cannot be read."""
+"""Errors of a recording that cannot be read."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """What was found in one phrase, which ends with *ready*, or with *not ready* if there is a fault."""
+        """The findings in one phrase, which ends with *ready*, or with *not ready* if there is a fault."""
         faults = sum(map(is_fault, self.findings))
         if faults:
             return f"{faults} fault{'s' * (faults != 1)}: not ready"

@@ -43,7 +43,7 @@ from dynslam_bench.sequences.catalogue import (
 from dynslam_bench.sequences.readers.layouts import layout_of
 
 RECEIPT = "fetched.json"
-"""What was fetched, as a `Receipt`, in the sequence's folder."""
+"""File in the sequence's folder that tells what was fetched, as a `Receipt`."""
 MANIFEST = "manifest.sha256"
 """Checksums of its files, in the format of ``sha256sum``."""
 
@@ -105,7 +105,7 @@ class Download(NamedTuple):
 
 
 def status(name: str, *, data_root: str | Path | None = None) -> Path | None:
-    """Where a public sequence lies, None if it is not on this machine.
+    """Folder of a public sequence, None if it is not on this machine.
 
     Raises:
         SequenceError: Unknown id.

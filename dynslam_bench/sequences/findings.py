@@ -1,4 +1,4 @@
-"""What a check of a recording can find: the table of findings, with their texts and what to change."""
+"""The table of findings that a check of a recording can make, with their texts and what to change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RESAVE = (
 )
 """The cure of a truth that is not in TUM's format."""
 _SO = "so they explain {then:.0f} % of the images' motion, as stored {now:.0f} %"
-"""How much of the motion the truth explains after the cure, and before."""
+"""Words on the shares of the motion that the truth explains after the cure, and before."""
 _FINDINGS: dict[str, tuple[str, str, str]] = {
     # Files that cannot be read, and recordings that are too short.
     "unreadable": (

@@ -241,7 +241,7 @@ def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
 
 
 def image_findings(statistics: ImageStatistics, with_depth: bool = True) -> list[Finding]:
-    """What is wrong with the images alone, the most basic fault first; what follows from a fault is not repeated.
+    """Findings on the images alone, the most basic fault first; what follows from a fault is not repeated.
 
     Args:
         statistics: Statistics of the frames that were read.

@@ -1,4 +1,4 @@
-"""What a sequence is hard for: how much of its scene moves, and how its camera moves."""
+"""Tags of a sequence's difficulty: how much of its scene moves, and how its camera moves."""
 
 from typing import Any, Literal
 
@@ -7,7 +7,7 @@ import numpy as np
 from dynslam_bench.geometry import Trajectory, se3
 
 Tag = Literal["static", "low-dynamic", "high-dynamic", "unknown-objects"]
-"""What moves in a scene: nothing, people who stay where they are, people who walk, things that are no people."""
+"""Motion in a scene: nothing, people who stay where they are, people who walk, things that are no people."""
 # mean speeds from which a camera counts as fast; TUM's fr1/desk has 0.4 m/s and 23 deg/s, fr1/rpy 0.06
 # and 50
 FAST_M_S = 1.0

@@ -84,7 +84,7 @@ _total = attrgetter("total")
 def truth_findings(
     stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]
 ) -> list[Finding]:
-    """What the truth of a recording does not share with its images, then what camera and depth do not.
+    """Findings on what the truth of a recording does not share with its images, then on camera and depth.
 
     Args:
         stamps: Stamps of the frames.

@@ -90,6 +90,7 @@ class Atlas:
             slack: How far the submap's directions may be rotated against those of the map that was
                 active, radians.
         """
+        # the new map's uncertainty adds to that of the map where the camera was lost
         slack = min(slack + self.slack(self.active, 0), np.pi)
         submap = Submap(start.copy(), *self._from_root(self.active, start, bound_m), slack)
         self.active = 1 + len(self.submaps)
@@ -126,7 +127,7 @@ class Atlas:
                 )
 
     def slack(self, one: int, other: int) -> float:
-        """How far the worlds of two maps may be rotated against each other, radians."""
+        """Largest rotation of the worlds of two maps against each other, radians."""
         if one == other:
             return 0.0
         # the root map has none
@@ -164,11 +165,12 @@ class Atlas:
                 ``[3]``.
             drift_m: Distance by which drift may have put it too far away, in units of the root map.
         """
+        # the start must lie within the bound around the place where the root map was left
         submap = self.submaps[number]
         return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)
 
     def _from_root(self, left: int, last: Array, bound_m: float) -> tuple[Array, float]:
-        """Where the root map was left ``[3]``, and how far from there the camera can be now.
+        """Place where the root map was left ``[3]``, and how far from there the camera can be now.
 
         Args:
             left: The map in which the camera was tracked last.
@@ -306,6 +308,7 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     slam_map = Map(camera, scales)
     slam_map.take_over(tables, header.next_keyframe, header.next_point)
 
+    # where each submap began, and how far it may lie from there
     submaps: list[Submap] = []
     for start, anchor, bound in zip(
         arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True
@@ -319,6 +322,7 @@ def _padded(rows: NDArray[Any], counts: NDArray[np.integer]) -> NDArray[Any]:
 
     The other places are 0.
     """
+    # row r uses its first counts[r] places; a mask fills them row by row
     in_use = np.arange(int(counts.max(initial=1))) < counts[:, None]
     table = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
     table[in_use] = rows

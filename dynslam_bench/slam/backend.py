@@ -39,6 +39,7 @@ from dynslam_bench.slam.motion_model import (
     trajectory,
 )
 from dynslam_bench.slam.observations import Observations, observe
+from dynslam_bench.slam.pose_optimisation import motion_covariance
 from dynslam_bench.slam.relocalisation import MotionBound, PoseSearch, RelocalisationGate
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 from dynslam_bench.slam.tracking import (
@@ -213,7 +214,9 @@ class Backend:
         """
         begin = perf_counter()
         self._refined_map = None
+        # the features that the filters keep, with depth, octave and information
         measured = observe(frame, keep, weight, self.camera, self.map.scales)
+        # the first frames make the map, later ones are tracked against it
         has_map = self.map.next_keyframe > 0
         if has_map:
             result = self._track(frame, measured)
@@ -272,7 +275,11 @@ class Backend:
 
         # insert a keyframe if the frame shows enough new
         result = self._update_map(frame, tracked, map_fit, pose_in_root_map)
-        return _with_match_counts(result, map_fit, initial)
+        result = _with_match_counts(result, map_fit, initial)
+        # a length in metres is known with depth alone
+        if not self.uses_depth:
+            return result
+        return replace(result, motion_covariance=motion_covariance(map_fit.estimate))
 
     # ------------------------------------------------------------------ steps of tracking
 
@@ -301,6 +308,7 @@ class Backend:
         """
         if self._last_frame is not None:
             return self._last_frame
+        # a loaded map: its features must be of the frame's kind
         stored_bytes = 8 * self.map.descriptor.shape[1]
         frame_bytes = 8 * measured.descriptors.shape[1]
         if len(measured) and frame_bytes != stored_bytes:
@@ -308,6 +316,7 @@ class Backend:
                 f"the map's descriptors have {stored_bytes} bytes, frame {frame.index}'s {frame_bytes}",
                 "make the map with the same features",
             )
+        # a frame without features, in the origin of the map's world
         keep_none = np.zeros(len(frame.xy), bool)
         weight = keep_none.astype(np.float32)
         empty = observe(frame, keep_none, weight, self.camera, self.map.scales)
@@ -402,13 +411,18 @@ class Backend:
         self, current: CurrentFrame, observations: Observations, map_fit: MapFit
     ) -> TrackedFrame:
         """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
+        # the inliers count as found; `LocalMapper` culls points that are seldom found
         points = map_fit.matches.point[map_fit.inliers]
         if self._mapping_enabled:
             self.map.found[points] += 1
+
+        # fuse the pose with the motion model's prediction, each by its information
         stamp = current.bundle.timestamp
         pose = self.motion.update(
             current.last, stamp, map_fit.estimate.T_cam_world, map_fit.estimate.information
         )
+
+        # the tracked frame, from which the next one starts
         observed = observe_points(observations, map_fit.matches.feature[map_fit.inliers], points)
         tracked = TrackedFrame(observations, observed, pose, stamp)
         self._status = CameraStatus.TRACKED
@@ -494,12 +508,15 @@ class Backend:
         self, frame: FrameBundle, observations: Observations, T_cam_world: Array
     ) -> TrackResult:
         """The frame becomes the first keyframe of the active map."""
+        # no feature observes a map point yet
         self._status = CameraStatus.TRACKED
         no_points = np.full(len(observations), -1, np.int64)
         tracked = TrackedFrame(observations, no_points, T_cam_world, frame.timestamp)
         self._last_frame = tracked
+        # its features with depth become map points
         timings, _ = self._insert_keyframe(frame, tracked)
         self._update_active_map()
+        # the pose defines the world, so that it is known exactly
         self._record_pose(frame, np.eye(4), KNOWN_POSE)
         points = int(np.count_nonzero(tracked.point >= 0))
         return self._result(T_cam_world, timings, matches=points, inliers=points)
@@ -532,6 +549,7 @@ class Backend:
 
     def _create_submap(self, current: CurrentFrame) -> TrackResult | None:
         """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""
+        # the camera turned while it was lost; how far it moved only bounds where the submap lies
         frame = current.bundle
         self._add_submap(current.last, frame.timestamp)
         T_cam_world = self._gate.rotated(current.last)
@@ -604,6 +622,7 @@ class Backend:
         # mapping may have removed some of the matched points since
         alive = np.where(self.map.alive[matched], matched, -1)
         observed = observe_points(tracked.observations, pose_in_root_map.matches.feature, alive)
+        # the next frame starts from the pose and the points of the root map
         self._last_frame = replace(
             tracked, point=observed, T_cam_world=pose_in_root_map.T_cam_world
         )
@@ -668,6 +687,7 @@ class Backend:
 
     def _transfer_history(self) -> None:
         """Poses relative to a culled keyframe become relative to its replacement."""
+        # the pose by way of the replacement: T_cam_replacement = T_cam_culled T_culled_replacement
         for culled, replacement, T_culled_replacement in self.mapper.culled:
             for pose in self.history:
                 if pose.reference == culled:
@@ -765,6 +785,7 @@ class MonocularBackend(Backend):
         """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
         begin = perf_counter()
         last = current.last
+        # look for a first view again, then for a second one with enough parallax
         first_try = self._unrecognised_frames == self.settings.relocalisation.new_map_after
         if first_try:
             self._initialiser = TwoViewInitialiser()
@@ -774,6 +795,8 @@ class MonocularBackend(Backend):
         if initial is None:
             return None
         seconds = perf_counter() - begin
+
+        # the submap begins where the camera was lost
         self._add_submap(last, initial.first.frame.timestamp)
         # the current frame is the second view, and is rotated as the images tell
         R_first_second = initial.motion.T_second_first[:3, :3].T
@@ -785,11 +808,14 @@ class MonocularBackend(Backend):
         self, initial: InitialMap, T_first_world: Array, seconds: float
     ) -> TrackResult:
         """The two views become keyframes; the second, which is the current frame, is tracked."""
+        # both views become keyframes, with the points triangulated from them
         first, second = initial.insert_into(self.map, T_first_world, self.atlas.active)
         frame = initial.second.frame
         observations = initial.second.observations
         pose = self.map.kf_pose[second].copy()
         point = self.map.kf_point[second, : len(observations)].astype(np.int64)
+
+        # tracking goes on from the second view
         self._initialiser = TwoViewInitialiser()
         self._status = CameraStatus.TRACKED
         self._last_frame = TrackedFrame(observations, point, pose, frame.timestamp)
@@ -798,6 +824,7 @@ class MonocularBackend(Backend):
         self._map_views.add_keyframe(first, initial.first.frame.depth)
         self._map_views.add_keyframe(second, frame.depth)
         self._update_active_map()
+        # the pose defines the scale and the world, so that it is known exactly
         self._record_pose(frame, np.eye(4), KNOWN_POSE)
         count = len(initial.motion.points)
         return self._result(pose, {"mapping": seconds}, matches=count, inliers=count)

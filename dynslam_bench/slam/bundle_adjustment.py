@@ -44,7 +44,7 @@ DAMPING = 1e-5
 LEAST_DAMPING = 1e-8
 """Steps that reduce the cost lower the damping down to this."""
 DAMPING_FLOOR = 1e-9
-"""What the diagonal grows by in any case, so that directions without any information can be solved for."""
+"""Least addition to the diagonal, so that directions without any information can be solved for."""
 CONVERGED_GAIN = 1e-5
 """The optimisation ends when a step reduces the cost by less than this share."""
 MIN_DETERMINANT = 1e-18
@@ -150,8 +150,18 @@ def _robust_cost(
     width: float,
     chi2: Array,
 ) -> float:
-    """Cost of all observations by Cauchy's kernel of this squared width; fills `chi2` (inf behind the camera)."""
+    """Cost of all observations by Cauchy's kernel of this squared width; fills `chi2` (inf behind the camera).
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        points: World points ``[Q, 3]``, metres.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        width: Squared width of the kernel, as a chi-square.
+        chi2: ``[N]``, filled.
+    """
     measured = observations.measured
+    # Cauchy's cost of a chi-square c at the squared width w: w log(1 + c / w)
     total = 0.0
     for k in range(observations.pose.shape[0]):
         _, chi2[k] = observation_chi2(
@@ -171,7 +181,18 @@ def _robust_cost(
 def _fill_point_jacobian(
     pose: Array, du_dx: float, du_dz: float, dv_dy: float, dv_dz: float, dr_dz: float, out: Array
 ) -> None:
-    """Derivatives ``[3, 3]`` of (u, v, right) by the world point: those in the camera frame times the rotation."""
+    """Derivatives ``[3, 3]`` of (u, v, right) by the world point: those in the camera frame times the rotation.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        du_dx: Derivative of u by x in the camera frame, which is that of `right`, too.
+        du_dz: Derivative of u by the depth.
+        dv_dy: Derivative of v by y.
+        dv_dz: Derivative of v by the depth.
+        dr_dz: Derivative of the right coordinate by the depth.
+        out: Filled.
+    """
+    # one column a world axis; `right` moves along x as u does
     for m in range(3):
         out[0, m] = du_dx * pose[0, m] + du_dz * pose[2, m]
         out[1, m] = dv_dy * pose[1, m] + dv_dz * pose[2, m]
@@ -190,20 +211,36 @@ def _fill_pose_jacobian(
     dr_dz: float,
     out: Array,
 ) -> None:
-    """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame."""
+    """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame.
+
+    Args:
+        x: The point in the camera frame, metres: to the right.
+        y: Downwards.
+        z: Forwards.
+        du_dx: Derivative of u by x, which is that of `right`, too.
+        du_dz: Derivative of u by z.
+        dv_dy: Derivative of v by y.
+        dv_dz: Derivative of v by z.
+        dr_dz: Derivative of the right coordinate by z.
+        out: Filled.
+    """
     # a rotation about an axis moves the point by the cross product: (0, -z, y), (z, 0, -x), (-y, x, 0)
+    # u
     out[0, 0] = du_dx
     out[0, 1] = 0.0
     out[0, 2] = du_dz
     out[0, 3] = du_dz * y
     out[0, 4] = du_dx * z - du_dz * x
     out[0, 5] = -du_dx * y
+    # v
+    # v
     out[1, 0] = 0.0
     out[1, 1] = dv_dy
     out[1, 2] = dv_dz
     out[1, 3] = dv_dz * y - dv_dy * z
     out[1, 4] = -dv_dz * x
     out[1, 5] = dv_dy * x
+    # the right coordinate
     out[2, 0] = du_dx
     out[2, 1] = 0.0
     out[2, 2] = dr_dz
@@ -227,6 +264,7 @@ def _invert_symmetric(h: Array, out: Array) -> None:
     c20 = h10 * h21 - h20 * h11
     # expansion along the first column
     determinant = h00 * c00 + h10 * c10 + h20 * c20
+    # the other three cofactors are needed only here
     if determinant > MIN_DETERMINANT:
         t = 1.0 / determinant
         out[0, 0] = c00 * t
@@ -251,7 +289,20 @@ def _linearise(
     damping: float,
     chi2: Array,
 ) -> NormalEquations:
-    """The damped Gauss-Newton system, each observation weighted by Cauchy's kernel of this squared width."""
+    """The damped Gauss-Newton system, each observation weighted by Cauchy's kernel of this squared width.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        variable: How many poses, the first ones, are refined.
+        points: World points ``[Q, 3]``.
+        observations: Which pose observes which point, and where; sorted by point.
+        camera: Intrinsics.
+        width: Squared width of the kernel.
+        damping: Share of each diagonal element that is added to it.
+        chi2: Chi-square of each observation ``[N]`` at these poses and points; infinite ones are
+            left out.
+    """
+    # the blocks of all poses and points, zero at first
     start = observations.start
     measured = observations.measured
     n = observations.pose.shape[0]
@@ -267,6 +318,7 @@ def _linearise(
     j_point = np.zeros((3, 3))
     residual = np.zeros(3)
     h_point = np.zeros((3, 3))
+    # point by point, with all its observations
     for i in range(q):
         h_point[:] = 0.0
         for k in range(start[i], start[i + 1]):
@@ -340,6 +392,7 @@ def _eliminate_points(
     """Reduce the system to the poses, in place: the Schur complement ``poses - coupling points^-1 coupling^T``."""
     start = observations.start
     y = np.zeros((6, 3))
+    # each point couples all poses that observe it
     for i in range(system.point_gradient.shape[0]):
         inverse = system.point_inverse[i]
         b = system.point_gradient[i]
@@ -355,6 +408,7 @@ def _eliminate_points(
                     y[m, o] = (
                         w[m, 0] * inverse[0, o] + w[m, 1] * inverse[1, o] + w[m, 2] * inverse[2, o]
                     )
+            # gradient -= coupling points^-1 point_gradient
             base = 6 * c
             for m in range(6):
                 system.gradient[base + m] -= y[m, 0] * b[0] + y[m, 1] * b[1] + y[m, 2] * b[2]
@@ -385,7 +439,16 @@ def _move_points(
     variable: int,
     new_points: Array,
 ) -> None:
-    """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``."""
+    """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``.
+
+    Args:
+        points: World points ``[Q, 3]`` before the step.
+        system: The system whose points were eliminated.
+        twists: Solution for the poses ``[6 P]``.
+        observations: Which pose observes which point.
+        variable: How many poses are refined.
+        new_points: ``[Q, 3]``, filled.
+    """
     start = observations.start
     # each point by itself: its gradient less what the poses' twists change, times the inverse block
     for i in range(points.shape[0]):
@@ -418,7 +481,20 @@ def _step(
     new_poses: Array,
     new_points: Array,
 ) -> bool:
-    """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
+    """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        variable: How many poses are refined.
+        points: World points ``[Q, 3]``.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        width: Squared width of the robust kernel.
+        damping: Levenberg-Marquardt's damping.
+        chi2: Chi-square of each observation ``[N]`` before the step.
+        new_poses: ``[P, 4, 4]``, filled.
+        new_points: ``[Q, 3]``, filled.
+    """
     system = _linearise(poses, variable, points, observations, camera, width, damping, chi2)
 
     # the points are many and depend on poses alone: eliminate them, and solve for the poses
@@ -447,13 +523,26 @@ def _adjust(
     iterations: int,
     chi2: Array,
 ) -> tuple[Array, Array, float]:
-    """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`."""
+    """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]`` to start from.
+        variable: How many poses are refined.
+        points: World points ``[Q, 3]`` to start from.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        iterations: Steps at most.
+        chi2: Chi-square of each observation ``[N]``, filled.
+    """
     # the kernel is as wide as the residuals are at the start
     _robust_cost(poses, points, observations, camera, 1.0, chi2)
+    # an observation with depth has three degrees of freedom: its chi-square is scaled to two
     trial = np.empty(len(chi2))
     for k in range(len(chi2)):
         depth = observations.measured.info_right[k] > 0.0
         trial[k] = chi2[k] * DEPTH_SHARE if depth else chi2[k]
+
+    # the cost at the start
     width = cauchy_width(trial)
     cost = _robust_cost(poses, points, observations, camera, width, chi2)
     damping = DAMPING
@@ -499,10 +588,13 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
         problem: Start values and observations; every point should have two observations or depth.
         iterations: Levenberg-Marquardt iterations at most.
     """
+    # where each point's observations begin: they are sorted by point
     chi2 = np.zeros(len(problem.obs_pose))
     start = np.searchsorted(problem.obs_point, np.arange(len(problem.points) + 1)).astype(np.int64)
     measured = Measurements(problem.uv, problem.right, problem.info, problem.info_right)
     observations = PointObservations(problem.obs_pose, problem.obs_point, start, measured)
+
+    # optimise
     poses, points, cost = _adjust(
         np.ascontiguousarray(problem.poses),
         problem.variable,
@@ -512,6 +604,8 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
         iterations,
         chi2,
     )
+
+    # observations within the 95 % quantile are inliers
     limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
     return BundleResult(poses, points, chi2, chi2 <= limit, float(cost))
 
@@ -547,11 +641,13 @@ def local_bundle(slam_map: Map, slot: int, window: int) -> Bundle | None:
         slot: The keyframe.
         window: Variable keyframes at most.
     """
+    # the keyframe and its most covisible ones vary, but for the oldest of all (id 0)
     near, _ = slam_map.covisible(slot)
     variable = np.concatenate([[slot], near[: window - 1]]).astype(np.int64)
     variable = variable[slam_map.kf_id[variable] > 0]
     if not len(variable):
         return None
+    # the keyframes that observe the same points hold the window in place
     points = slam_map.points_of(variable)
     fixed, _ = slam_map.covisible_of(points)
     fixed = fixed[~np.isin(fixed, variable)][:FIXED_KEYFRAMES]
@@ -570,6 +666,7 @@ def full_bundle(slam_map: Map) -> Bundle | None:
     keyframes = slam_map.keyframes
     if len(keyframes) < 2:
         return None
+    # no budget: every observation counts
     all_observations = int(slam_map.n_obs[slam_map.points].sum())
     return _bundle(slam_map, keyframes[1:], keyframes[:1], slam_map.points, all_observations)
 
@@ -577,7 +674,15 @@ def full_bundle(slam_map: Map) -> Bundle | None:
 def _bundle(
     slam_map: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int
 ) -> Bundle | None:
-    """The bundle of these keyframes and points (slots); None if no point is observed often enough."""
+    """The bundle of these keyframes and points (slots); None if no point is observed often enough.
+
+    Args:
+        slam_map: The map.
+        variable: Keyframes that are refined.
+        fixed: Keyframes that stay.
+        points: Points that they observe; those with too few views are left out.
+        max_observations: Observations at most; points with the most views come first.
+    """
     # observations of the points, and the number in the bundle of the pose that each is made from
     poses = np.concatenate([variable, fixed])
     pose_number = np.full(slam_map.kf_alive.size, -1, np.int64)
@@ -602,6 +707,8 @@ def _bundle(
     obs_pose = pose[used]
     points = points[order]
     features = all_features[used].astype(np.int64)
+
+    # the measurements of these observations
     observers = poses[obs_pose]
     problem = BundleProblem(
         slam_map.kf_pose[poses],

@@ -115,21 +115,15 @@ class TwoViewMotion:
         _, in_motion, in_newest = np.intersect1d(
             self.matches[:, 0], newest.matches[:, 0], return_indices=True
         )
-        rows = newest.matches[in_newest, 1]
-        observations = newest.observations
-        estimate = optimise_pose(
-            self.T_second_first,
-            self.points[in_motion],
-            observations.xy[rows],
-            observations.right[rows],
-            observations.info[rows],
-            observations.info_right[rows],
-            camera,
-        )
-        return estimate.T_cam_world
+        points = self.points[in_motion]
+
+        # fit the newest pose to them, starting from the pose of the view before
+        measured = newest.observations.measurements(newest.matches[in_newest, 1])
+        return optimise_pose(self.T_second_first, points, measured, camera).T_cam_world
 
     def same_as(self, other: TwoViewMotion) -> bool:
         """Whether it is the same motion as another."""
+        # the angle between the rotations, and that between the directions of the translations
         rotation = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
         cosine = _direction(self.T_second_first) @ _direction(other.T_second_first)
         between = np.arccos(np.clip(cosine, -1.0, 1.0))
@@ -141,6 +135,7 @@ class TwoViewMotion:
         """Whether it explains all views so much better than another motion that the other is ruled out."""
         if self.same_as(other):
             return True
+        # more in all, and by a factor: many observations make any small difference large
         more_chi2 = (other.cost - self.cost) * self.count
         return bool(more_chi2 > RIVAL_COST and other.cost > RIVAL_FACTOR * self.cost)
 
@@ -165,6 +160,7 @@ def match_views(
     Returns:
         int64 ``[M, 2]``, features of the first view and of the second.
     """
+    # nearest descriptors in the windows; the right coordinate is unknown
     windows = expected, np.full(len(first), np.nan), np.full(len(first), radius_px)
     free = np.ones(len(second), bool)
     feature = search_in_radius(
@@ -176,6 +172,8 @@ def match_views(
         max_distance=MAX_DISTANCE,
         ratio=RATIO,
     )
+
+    # matches that rotate in the image as most others
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]
     return np.stack([rows, feature[rows]], axis=1)
@@ -289,7 +287,15 @@ def distinct_motions(motions: Sequence[TwoViewMotion]) -> list[TwoViewMotion]:
 def _homography(
     xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[list[Array], NDArray[np.bool_]]:
-    """The motions of the homography of most matches, and which matches fit it in both images."""
+    """The motions of the homography of most matches, and which matches fit it in both images.
+
+    Args:
+        xy_first: Pixels ``[N, 2]`` of the first view.
+        xy_second: Pixels ``[N, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[N]``.
+        camera: Intrinsics without distortion.
+    """
+    # RANSAC; the limit is for a standard deviation of one pixel
     limit = np.sqrt(CHI2_POINT)
     model, _ = cv2.findHomography(
         xy_first, xy_second, cv2.RANSAC, limit, None, RANSAC_ITERATIONS, CONFIDENCE
@@ -317,7 +323,15 @@ def _homography(
 def _essential(
     xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[list[Array], NDArray[np.bool_]]:
-    """The motions of the essential matrix of most matches, and which matches fit it in both images."""
+    """The motions of the essential matrix of most matches, and which matches fit it in both images.
+
+    Args:
+        xy_first: Pixels ``[N, 2]`` of the first view.
+        xy_second: Pixels ``[N, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[N]``.
+        camera: Intrinsics without distortion.
+    """
+    # RANSAC; the limit is for a standard deviation of one pixel
     limit = np.sqrt(CHI2_LINE)
     model, _ = cv2.findEssentialMat(
         xy_first, xy_second, camera.matrix, cv2.RANSAC, CONFIDENCE, limit, RANSAC_ITERATIONS
@@ -355,13 +369,24 @@ def _pose(rotation: Any, translation: Any) -> Array:
 def _triangulated(
     T_second_first: Array, xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Points ``[M, 3]`` in the first camera's frame, and which of them lie before both cameras and project back."""
+    """Points ``[M, 3]`` in the first camera's frame, and which of them lie before both cameras and project back.
+
+    Args:
+        T_second_first: Motion ``[4, 4]`` between the views.
+        xy_first: Pixels ``[M, 2]`` of the first view.
+        xy_second: Pixels ``[M, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[M]``.
+        camera: Intrinsics without distortion.
+    """
+    # linear triangulation; points at infinity become 0, which is not good below
     projections = camera.matrix @ np.eye(3, 4), camera.matrix @ T_second_first[:3]
     homogeneous = cv2.triangulatePoints(*projections, xy_first.T, xy_second.T).T
     with np.errstate(divide="ignore", invalid="ignore"):
         points = np.nan_to_num(
             homogeneous[:, :3] / homogeneous[:, 3:], nan=0.0, posinf=0.0, neginf=0.0
         )
+
+    # before both cameras, and near the pixels of both features
     in_second = se3.transform(T_second_first, points)
     good = (points[:, 2] > NEAR_M) & (in_second[:, 2] > NEAR_M)
     for local, xy in ((points, xy_first), (in_second, xy_second)):
@@ -392,7 +417,16 @@ def _adjusted(
     points: Array,
     camera: Camera,
 ) -> TwoViewMotion:
-    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`."""
+    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`.
+
+    Args:
+        first: The first view, whose pose is the identity.
+        later: Further views, the newest last.
+        poses: Their poses ``[V, 4, 4]``, first view to camera, to start from.
+        matches: Features of the first view and of the newest one, ``[M, 2]``.
+        points: Their points ``[M, 3]`` in the first camera's frame.
+        camera: Intrinsics without distortion.
+    """
     # observations of the points in the first view (number 0) and in the later ones
     count = len(later)
     point_of_feature = np.full(len(first), -1, np.int64)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.features.matching import (
     FAR,
     CellGrid,
@@ -157,15 +157,19 @@ class LocalMapper:
         self, slot: int, observations: Observations, *, everything: bool
     ) -> None:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
+        # features that observe no point and have a depth, nearest first
         slam_map = self.map
         has_no_point = slam_map.kf_point[slot, : len(observations)] < 0
         free = np.flatnonzero(has_no_point & (observations.z > 0))
         nearest_first = free[np.argsort(observations.z[free], kind="stable")]
+        # far depths are noisy: they make points only where there are few close ones
         if everything:
             chosen = nearest_first
         else:
             close = np.count_nonzero(observations.z[free] < self.close_m)
             chosen = nearest_first[: max(close, MIN_DEPTH_POINTS)]
+
+        # from the camera frame to the world
         T_world_cam = se3.inverse(slam_map.kf_pose[slot])
         local = slam_map.camera.unproject(observations.xy[chosen], observations.z[chosen])
         self._add_points(slot, chosen, se3.transform(T_world_cam, local), observations)
@@ -174,6 +178,7 @@ class LocalMapper:
         self, slot: int, neighbours: Slots, observations: Observations
     ) -> None:
         """Points for features without one, by triangulation with each neighbouring keyframe in turn."""
+        # features that one neighbour gave a point are no longer free for the next
         for neighbour in neighbours.tolist():
             features, neighbour_features, position = triangulate(
                 self.map, slot, neighbour, self.settings.mapping.min_parallax_sigmas
@@ -198,6 +203,7 @@ class LocalMapper:
             observations: All features of the keyframe.
             second: Another keyframe that observes the points, and its features ``[N]``.
         """
+        # each point with the observation that made it, and the second view's
         created = self.map.add_points(position, observations.rgb[features], slot, features)
         if second is not None:
             self.map.observe(*second, created)
@@ -206,10 +212,12 @@ class LocalMapper:
 
     def _cull_points(self) -> None:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
+        # points of the last `YOUNG` keyframes; older ones have proved themselves
         slam_map = self.map
         young = self._young[slam_map.alive[self._young]]
         # age in keyframes since the point was made
         age = slam_map.next_keyframe - 1 - slam_map.born[young]
+        # found in too few of the frames where it was in view, or observed by too few keyframes
         min_found_ratio = self.settings.mapping.min_found_ratio
         seldom_found = slam_map.found[young] < min_found_ratio * slam_map.visible[young]
         seldom_observed = (age >= OBSERVED_AFTER) & (slam_map.n_obs[young] < MIN_OBSERVATIONS)
@@ -221,6 +229,7 @@ class LocalMapper:
 
     def _fuse(self, slot: int, neighbours: Slots) -> None:
         """Match the new keyframe's points in its neighbours and theirs in it; merge duplicates."""
+        # the new points in each neighbour, then the neighbours' points in the new keyframe
         for other in neighbours.tolist():
             self.fuse_into(other, self.map.points_of(slot))
         self.fuse_into(slot, self.map.points_of(neighbours))
@@ -276,11 +285,13 @@ class LocalMapper:
 
     def adjust(self, slot: int) -> None:
         """Local bundle adjustment around a keyframe; observations that do not fit afterwards are removed."""
+        # the window around the keyframe
         slam_map = self.map
         settings = self.settings.bundle_adjustment
         bundle = local_bundle(slam_map, slot, settings.window)
         if bundle is not None:
             points = bundle.points
+            # observations that do not fit the optimum are removed, and their points renewed
             outliers = ~apply_bundle_adjustment(slam_map, bundle, settings.iterations)
             observers = bundle.poses[bundle.problem.obs_pose[outliers]]
             slam_map.unobserve(observers, bundle.features[outliers])
@@ -299,6 +310,7 @@ class LocalMapper:
         for neighbour in neighbours.tolist():
             if neighbour in newest or slam_map.kf_id[neighbour] == 0:
                 continue
+            # redundant: three other keyframes see the point as finely
             total, redundant = slam_map.redundancy(neighbour, self.close_m)
             if total and redundant > settings.redundant_share * total:
                 self.cull_keyframe(neighbour)
@@ -343,6 +355,7 @@ class LocalMapper:
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
+        # the keyframe that shares most points takes over what refers to this one
         slam_map = self.map
         covisible, _ = slam_map.covisible(slot)
         if len(covisible):
@@ -350,6 +363,8 @@ class LocalMapper:
         else:
             same_map = slam_map.submap(int(slam_map.kf_map[slot]))
             replacement = int(same_map[same_map != slot][-1])
+
+        # the relative pose is kept: poses of frames are relative to keyframes
         T_culled_replacement = slam_map.kf_pose[slot] @ se3.inverse(slam_map.kf_pose[replacement])
         self.culled.append((slot, replacement, T_culled_replacement))
         slam_map.remove_keyframe(slot)
@@ -357,6 +372,7 @@ class LocalMapper:
 
 def apply_bundle_adjustment(slam_map: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
     """Put refined poses and points into the map; returns which observations of the bundle fit them."""
+    # fixed poses come back as they were
     result = adjust_bundle(bundle.problem, iterations)
     variable = bundle.poses[: bundle.problem.variable]
     for slot, pose in zip(variable.tolist(), result.poses, strict=False):
@@ -411,6 +427,7 @@ class KeyframePolicy:
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
         """
+        # inliers now, and the most since the last keyframe
         settings = self.settings
         matched = tracked.point >= 0
         inliers = int(np.count_nonzero(matched))
@@ -440,14 +457,16 @@ class KeyframePolicy:
 
 
 def established_points(slam_map: Map, keyframe: int) -> int:
-    """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
+    """Number of a keyframe's points that `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
     points = slam_map.kf_point[keyframe]
+    # keyframes of the submap: a young one has fewer than `ESTABLISHED`
     young = np.count_nonzero(slam_map.kf_alive & (slam_map.kf_map == slam_map.kf_map[keyframe]))
     return int(np.count_nonzero(slam_map.n_obs[points[points >= 0]] >= min(ESTABLISHED, young)))
 
 
 def share_in_view(slam_map: Map, keyframe: int, T_cam_world: Array) -> float:
-    """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
+    """Share of a keyframe's points that lies in another camera's image; 1 if it has none."""
+    # its points in the other camera's frame, then in the image
     points = slam_map.kf_point[keyframe]
     position = slam_map.position[points[points >= 0]]
     _, inside = slam_map.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
@@ -480,17 +499,50 @@ class View(NamedTuple):
 @kernel
 def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
     """Rotation ``[3, 3]`` and translation ``[3]`` from camera `a` to camera `b`: ``x_b = r x_a + t``."""
+    # r = R_b R_a^T
     r = np.zeros((3, 3))
     t = np.zeros(3)
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 r[i, j] += pose_b[i, k] * pose_a[j, k]
+    # t = t_b - r t_a
     for i in range(3):
         t[i] = pose_b[i, 3]
         for k in range(3):
             t[i] -= r[i, k] * pose_a[k, 3]
     return r, t
+
+
+@inlined
+def _depths_fit(depth_a: float, depth_b: float, measured_b: float) -> bool:
+    """Whether a triangulated point lies before both cameras, not too far away, and where camera b measured it.
+
+    Args:
+        depth_a: Its depth in camera a, metres.
+        depth_b: Its depth in camera b.
+        measured_b: Depth that was measured at b's feature, 0 missing.
+    """
+    if depth_a < MIN_TRIANGULATED_DEPTH or depth_b < MIN_TRIANGULATED_DEPTH:
+        return False
+    if depth_a > MAX_TRIANGULATED_DEPTH:
+        return False
+    return not (measured_b > 0.0 and abs(depth_b - measured_b) > DEPTH_TOLERANCE * measured_b)
+
+
+@inlined
+def _scales_fit(distance_a: float, distance_b: float, scale_a: float, scale_b: float) -> bool:
+    """Whether the octaves of two features agree with a point's distances: nearer means larger, at a coarser octave.
+
+    Args:
+        distance_a: Distance of the point from camera a.
+        distance_b: Distance of the point from camera b.
+        scale_a: Scale of the octave of a's feature, 1 for the finest.
+        scale_b: Scale of the octave of b's feature.
+    """
+    ratio = distance_a / distance_b
+    expected = scale_b / scale_a
+    return not (ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected)
 
 
 @kernel
@@ -576,29 +628,19 @@ def _triangulate(
             else:
                 continue
 
-            # the point must lie in front of both cameras, and where b measured it
+            # the point must fit both features
             depth_b = ray_z * depth_a + t[2]
-            measured_b = view_b.z[b]
-            if (
-                depth_a < MIN_TRIANGULATED_DEPTH
-                or depth_b < MIN_TRIANGULATED_DEPTH
-                or depth_a > MAX_TRIANGULATED_DEPTH
-                or (measured_b > 0.0 and abs(depth_b - measured_b) > DEPTH_TOLERANCE * measured_b)
-            ):
+            if not _depths_fit(depth_a, depth_b, view_b.z[b]):
                 continue
-
-            # its projection must fit b's feature
             error_x = (ray_x * depth_a + t[0]) / depth_b - bx[j]
             error_y = (ray_y * depth_a + t[1]) / depth_b - by[j]
             if error_x * error_x + error_y * error_y > CHI2_POINT * sigma * sigma:
                 continue
-
-            # the nearer view shows the patch larger, hence at a coarser octave
-            ratio = (depth_a * np.sqrt(x * x + y * y + 1.0)) / (
-                depth_b * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
-            )
-            expected = scales[view_b.octave[b]] / scales[view_a.octave[a]]
-            if ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected:
+            distance_a = depth_a * np.sqrt(x * x + y * y + 1.0)
+            distance_b = depth_b * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
+            if not _scales_fit(
+                distance_a, distance_b, scales[view_a.octave[a]], scales[view_b.octave[b]]
+            ):
                 continue
             best_distance[i] = bits
             match[i] = j
@@ -630,6 +672,7 @@ def triangulate(
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
+    # match and triangulate
     view = _view(slam_map, slot)
     other_view = _view(slam_map, other)
     matched_by, match, depth = _triangulate(
@@ -639,9 +682,13 @@ def triangulate(
         intrinsics_of(slam_map.camera),
         float(min_parallax_sigmas),
     )
+
+    # the pairs, in the order of the new keyframe's features
     chosen = np.sort(matched_by[matched_by >= 0])
     features = view.free[chosen]
     other_features = other_view.free[match[chosen]]
+
+    # their points, from the new keyframe's frame to the world
     local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth[chosen])
     position = se3.transform(se3.inverse(slam_map.kf_pose[slot]), local)
     return features, other_features, position

@@ -122,6 +122,7 @@ class Correction:
     @property
     def T_now_before(self) -> Array:
         """Transform ``[4, 4]`` from the keyframe's world, once its lengths are multiplied, to the place's world."""
+        # the pose with its translation in the new unit, then by way of the camera
         before = self.T_cam_before.copy()
         before[:3, 3] *= self.scale
         return se3.inverse(self.T_cam_now) @ before
@@ -132,12 +133,14 @@ class Correction:
         return Correction(self.T_cam_now, self.T_cam_before, 1 / self.scale)
 
     def moved(self, at: Array) -> Array:
-        """Where a place ``[3]`` near the keyframe is after the correction, ``[3]``."""
+        """Move a place ``[3]`` near the keyframe as the correction does, ``[3]``."""
+        # in the camera frame, in the new unit; then by the new pose
         local = self.scale * se3.transform(self.T_cam_before, at[None])
         return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
 
     def agrees(self, other: Correction, at: Array) -> bool:
         """Whether another correction moves a place nearly as this one does."""
+        # compared at the camera, since far from it a small rotation moves much
         distance = np.linalg.norm(self.moved(at) - other.moved(at))
         rotation = se3.rotation_angle(self.T_now_before @ se3.inverse(other.T_now_before))
         scale = abs(np.log(self.scale / other.scale))
@@ -296,13 +299,16 @@ class LoopCloser:
 
     def _confirmed(self, slot: int, loop: Loop | None) -> Loop | None:
         """The loop with the median scale of all keyframes that agree on it, once there are enough; else None."""
+        # a keyframe without a loop breaks the row
         if loop is None:
             self._consistent.clear()
             return None
+        # so does one whose correction differs from the last one's
         centre = self.map.kf_centre[slot]
         if self._consistent and not loop.correction.agrees(self._consistent[-1], centre):
             self._consistent.clear()
         self._consistent.append(loop.correction)
+        # wait for more, then take the median of their scales
         if len(self._consistent) < self.settings.loop_closing.confirmations:
             return None
         scale = float(np.median([correction.scale for correction in self._consistent]))
@@ -358,7 +364,14 @@ class LoopCloser:
     def _verified_candidate(
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
-        """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
+        """The loop to a candidate, if the points around it explain enough and drift explains the correction.
+
+        Args:
+            slot: The newest keyframe.
+            candidate: The keyframe whose place it may show.
+            observations: Features of the newest keyframe.
+            rng: Draws RANSAC's samples.
+        """
         # the pose by the points around the candidate
         s = self.settings.loop_closing
         tracking = self.settings.tracking
@@ -497,8 +510,10 @@ class LoopCloser:
 
     def _path_since(self, slot: int) -> float:
         """The path whose drift adds up since a keyframe: the length since then, or over a closed loop."""
+        # the shortest way along the path and over one closed loop
         then = self._path_at(slot)
         shortcuts = (abs(then - old) + self._path_length - new for old, new in self._shortcuts)
+        # beyond a section drift grows as the root of the path
         path = min([self._path_length - then, *shortcuts])
         return min(path, float(np.sqrt(DRIFT_SECTION * path)))
 
@@ -599,7 +614,14 @@ class LoopCloser:
         return dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
-        """The edge between two keyframes by the pose of the first and one of the other, both world to camera."""
+        """The edge between two keyframes by the pose of the first and one of the other, both world to camera.
+
+        Args:
+            one: Slot of the first keyframe.
+            other: Slot of the other.
+            pose_of_other: World to camera ``[4, 4]``, as the edge has it.
+            weight: Information weight.
+        """
         id_one, id_other = self.map.kf_id[[one, other]].tolist()
         return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.map.kf_pose[one]), weight)
 
@@ -619,6 +641,7 @@ class LoopCloser:
 
     def _fuse(self, slot: int, candidate: int) -> None:
         """Fuse the points around both ends of a loop, and adjust what lies around the new keyframe."""
+        # points around the recognised keyframe, matched in each keyframe around the new one
         points = self.map.points_of(keyframe_neighbourhood(self.map, candidate))
         for keyframe in keyframe_neighbourhood(self.map, slot).tolist():
             self.mapper.fuse_into(keyframe, points)
@@ -648,6 +671,7 @@ class Edge:
 
 def rescaled_edges(edges: Sequence[Edge], ids: Slots, factors: Array) -> list[Edge]:
     """The edges after lengths at keyframes were multiplied by factors."""
+    # the translation of an edge is a length at its first keyframe
     by_id = dict(zip(ids.tolist(), factors.tolist(), strict=True))
     poses = np.array([edge.T_other_one for edge in edges]).reshape(-1, 4, 4)
     poses[:, :3, 3] *= np.reshape([by_id.get(edge.one, 1.0) for edge in edges], (-1, 1))
@@ -668,10 +692,12 @@ def transferred_edges(
     """
     transferred = []
     for edge in edges:
+        # T_other_replacement = T_other_culled T_culled_replacement
         if edge.one == culled:
             edge = replace(
                 edge, one=replacement, T_other_one=edge.T_other_one @ T_culled_replacement
             )
+        # T_replacement_one = T_replacement_culled T_culled_one
         if edge.other == culled:
             edge = replace(
                 edge,
@@ -688,7 +714,7 @@ def edges_within(ids: Slots, edges: Sequence[Edge]) -> list[Edge]:
 
 
 def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: float) -> Array:
-    """What lengths at each keyframe are to be multiplied by, so that a loop edge's scale is met.
+    """Factors for the lengths at each keyframe with which a loop edge's scale is met.
 
     Logarithms of scales are to be equal at both ends of an edge, and to differ by that of `scale`
     at the loop edge's. The sum of squared errors is least. Strasdat, Montiel and Davison (Scale
@@ -770,14 +796,32 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
 def _edge_errors(
     poses: Array, one: Slots, other: Slots, T_one_other: Array, sigmas: Array
 ) -> Array:
-    """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
+    """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas.
+
+    Args:
+        poses: World to camera ``[N, 4, 4]``.
+        one: Row of the pose at the first end of each edge ``[E]``.
+        other: Row of the pose at the other end ``[E]``.
+        T_one_other: Measured poses ``[E, 4, 4]`` from the other camera's frame to the first one's.
+        sigmas: Standard deviations ``[E, 6]``.
+    """
+    # identity if T_other_one of the poses is the measured one
     return se3.log(poses[other] @ se3.inverse(poses[one]) @ T_one_other) / sigmas
 
 
 def _graph_step(
     poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float
 ) -> Array:
-    """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
+    """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero.
+
+    Args:
+        poses: World to camera ``[N, 4, 4]``.
+        one: Row of the pose at the first end of each edge ``[E]``.
+        other: Row of the pose at the other end ``[E]``.
+        error: Errors ``[E, 6]`` of the edges, in their sigmas.
+        sigmas: Standard deviations ``[E, 6]``.
+        damping: Levenberg-Marquardt's damping, relative to the diagonal.
+    """
     # how each error follows a twist on the left of either pose: blocks [6, 6]
     jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]
@@ -799,6 +843,7 @@ def _graph_step(
 
 def _adjoint(pose: Array) -> Array:
     """Matrices ``[..., 6, 6]`` that turn twists (translation, rotation) into the frame a pose leads to."""
+    # [R, hat(t) R; 0, R]
     rotation = pose[..., :3, :3]
     return np.block(
         [[rotation, se3.hat(pose[..., :3, 3]) @ rotation], [np.zeros_like(rotation), rotation]]
@@ -807,6 +852,7 @@ def _adjoint(pose: Array) -> Array:
 
 def _inverse_left_jacobian(twist: Array) -> Array:
     """``[..., 6, 6]``, to second order: how the logarithm of a pose follows a twist on its left."""
+    # I - ad / 2 + ad^2 / 12, with ad the adjoint of the twist (Baker-Campbell-Hausdorff series)
     by_translation = se3.hat(twist[..., :3])
     by_rotation = se3.hat(twist[..., 3:])
     ad = np.block([[by_rotation, by_translation], [np.zeros_like(by_rotation), by_rotation]])

@@ -232,6 +232,7 @@ class Map:
 
     def points_of(self, keyframes: Slots | int) -> Slots:
         """Slots of the points that keyframes observe, ascending."""
+        # a flag a point: each is listed once, however many keyframes observe it
         observed = np.zeros(self.alive.size, bool)
         points = self.kf_point[keyframes]
         observed[points[points >= 0]] = True
@@ -250,7 +251,15 @@ class Map:
         stamp: float,
         submap: int = 0,
     ) -> int:
-        """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
+        """Store a frame's features as a keyframe that observes no points yet; returns its slot.
+
+        Args:
+            observations: The frame's features.
+            T_cam_world: Its pose ``[4, 4]``.
+            frame: Its index.
+            stamp: Its timestamp, seconds.
+            submap: Number of the submap that it belongs to.
+        """
         # the keyframe: number, map, frame, pose
         n = len(observations)
         slot = self._free_keyframe_slot(*observations.descriptors.shape)
@@ -365,7 +374,14 @@ class Map:
     def add_points(
         self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots
     ) -> Slots:
-        """New points ``[N, 3]`` that features of a keyframe observe; returns their slots."""
+        """New points ``[N, 3]`` that features of a keyframe observe; returns their slots.
+
+        Args:
+            position: World points, metres.
+            rgb: Their colours, uint8 ``[N, 3]``.
+            keyframe: Slot of the keyframe.
+            features: Its features ``[N]``, which observe nothing yet.
+        """
         # freed slots first, then new ones behind the others
         n = len(position)
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
@@ -397,13 +413,16 @@ class Map:
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
         """Remove observations; points that lose their last one are removed."""
+        # the points that the features observe now, before the links are cut
         points = self.kf_point[keyframes, features].astype(np.int64)
         _unlink(self._observation_tables, keyframes, features)
+        # a point without observations has nothing that holds it
         points = np.unique(points[points >= 0])
         self.remove_points(points[self.n_obs[points] == 0])
 
     def remove_points(self, points: Slots) -> None:
         """Remove points and their observations."""
+        # cut the links of the features; the slots stay taken until `release`
         points = np.unique(points[self.alive[points]])
         self.kf_point[self.observations(points)] = -1
         self.n_obs[points] = 0
@@ -412,6 +431,7 @@ class Map:
 
     def replace_point(self, old: int, new: int) -> None:
         """Replace a point by another that is the same point of the scene."""
+        # its observations become those of the new point
         self._reserve(int(self.n_obs[new] + self.n_obs[old]))
         _replace(self._observation_tables, old, new)
         # the frames that should have observed either one, and those that did, count for the new one
@@ -422,7 +442,9 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
+        # compiled code reads named tuples
         views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
+        # scale of each octave, 1 for the finest
         to_octave_0 = self.scales / self.scales[0]
         _refresh(
             points, self._point_views, self.descriptor, self._observation_tables, views, to_octave_0
@@ -458,7 +480,7 @@ class Map:
     # ------------------------------------------------------------------ views
 
     def project(self, T_cam_world: Array, candidates: Slots) -> VisiblePoints:
-        """Which of the candidate points a camera should see, and where.
+        """Project candidate points: those that a camera should see, and where.
 
         Args:
             T_cam_world: World-to-camera pose ``[4, 4]``.
@@ -485,6 +507,7 @@ class Map:
 
         All points of a keyframe without any depth count as close.
         """
+        # far points are known too inexactly to make a keyframe redundant or not
         depth = self.kf_z[slot, : self.kf_count[slot]]
         if depth.any():
             close = (depth > 0) & (depth <= close_m)
@@ -497,7 +520,7 @@ class Map:
 
 
 MapView: TypeAlias = tuple[tuple[KeyframeView, ...], tuple[Slots, Array]]
-"""What filters may read of the map: the newest keyframes, newest first, at most `VIEWS`; ids ``[M]`` and world
+"""The map as filters may read it: the newest keyframes, newest first, at most `VIEWS`; ids ``[M]`` and world
 positions ``[M, 3]`` in metres of all points."""
 
 
@@ -560,6 +583,7 @@ class MapViews:
     def of(self, submap: int) -> MapView:
         """View that filters get while the camera is in a submap."""
         slam_map = self._map
+        # keyframes only come with `next_keyframe`: until then the view holds
         if self._computed_for != (slam_map.next_keyframe, submap):
             self._computed_for = slam_map.next_keyframe, submap
             newest = slam_map.submap(submap)[::-1][:VIEWS].tolist()
@@ -640,6 +664,7 @@ def _replace(tables: ObservationTables, old: int, new: int) -> None:
     """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
     obs_kf = tables.obs_kf
     obs_ft = tables.obs_ft
+    # the feature is freed first, or it would count as taken
     for o in range(tables.n_obs[old]):
         tables.kf_point[obs_kf[old, o], obs_ft[old, o]] = -1
         _link_one(tables, obs_kf[old, o], obs_ft[old, o], new)
@@ -655,7 +680,17 @@ def _refresh(
     keyframes: KeyframeViews,
     scales: Array,
 ) -> None:
-    """Renew descriptor, viewing direction and scale range of the points from their observations."""
+    """Renew descriptor, viewing direction and scale range of the points from their observations.
+
+    Args:
+        points: Slots of the points.
+        views: Positions, viewing directions and scale ranges of all points; the latter two are
+            changed.
+        descriptors: uint64 ``[M, W]`` of all points, changed.
+        tables: Which features of which keyframes observe them.
+        keyframes: Descriptors, octaves and centres of all keyframes.
+        scales: Scale of each octave, 1 for the finest.
+    """
     obs_kf = tables.obs_kf
     obs_ft = tables.obs_ft
     for i in range(points.shape[0]):
@@ -716,12 +751,23 @@ def _project(
     scale_factor: float,
     levels: int,
 ) -> tuple[int, Slots, Array, Array, Slots, Array]:
-    """How many of the candidate points the camera should see, and these, see `VisiblePoints`, in longer arrays.
+    """Count the candidate points that the camera should see, and list them, see `VisiblePoints`, in longer arrays.
 
     They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
     side that they were seen from before (ORB-SLAM2's ``isInFrustum``).
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        candidates: Slots of the points.
+        views: Positions, viewing directions and scale ranges of all points.
+        camera: Intrinsics without distortion.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        scale_factor: Ratio of consecutive pyramid levels.
+        levels: Number of pyramid levels.
     """
     n = candidates.shape[0]
+    # results, as long as if all candidates were visible
     index = np.empty(n, np.int64)
     octave = np.empty(n, np.int64)
     uv = np.empty((n, 2))
@@ -779,7 +825,14 @@ def _project(
 def _redundancy(
     keyframe: int, close: NDArray[np.bool_], kf_octave: Any, tables: ObservationTables
 ) -> tuple[int, int]:
-    """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
+    """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser.
+
+    Args:
+        keyframe: Slot of the keyframe.
+        close: bool ``[F]``, features whose depth is close.
+        kf_octave: Octaves ``[S, F]`` of all keyframes' features.
+        tables: Which features of which keyframes observe which points.
+    """
     obs_kf = tables.obs_kf
     obs_ft = tables.obs_ft
     total = 0

@@ -31,9 +31,9 @@ MAP_SCHEMA = 1
 HEADER = "header"
 """Name of the array that holds the header's JSON text."""
 ARRAY_HEADER_BYTES = 256
-"""What numpy writes before an array, at most."""
+"""Most bytes that numpy writes before an array."""
 MAKE_ONE = "a map is made by: run --save-map"
-"""What to do where a file is no map."""
+"""Cure where a file is no map."""
 
 Sensors = Literal["rgbd", "rgb"]
 Arrays = Mapping[str, NDArray[Any]]

@@ -1,4 +1,4 @@
-"""How a hand-held camera moves: white-noise acceleration, as a filter while tracking and a smoother afterwards.
+"""Model of a hand-held camera's motion: white-noise acceleration, as a filter while tracking and a smoother afterwards.
 
 State of the filter: position p and velocity v in the world, orientation R_cam_world and angular
 velocity w in the camera frame; accelerations are white noise. The measurement is the pose that the
@@ -28,6 +28,7 @@ from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.gauss_newton import apply_twist
 from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.observations import Observations, right_coordinates
+from dynslam_bench.slam.pose_optimisation import Intrinsics, intrinsics_of
 from dynslam_bench.slam.settings import MotionModelSettings
 from dynslam_bench.slam.tracking import (
     MapFit,
@@ -210,7 +211,14 @@ def smooth(
 def _smooth_segment(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
-    """`smooth` within a part without gaps."""
+    """`smooth` within a part without gaps.
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        poses: Measured world-to-camera poses ``[N, 4, 4]``.
+        covariances: Their covariances ``[N, 6, 6]``.
+        settings: Standard deviations of the accelerations.
+    """
     # forwards: filter, and keep each prediction
     state = MotionState.at(poses[0], covariances[0])
     filtered = [state]
@@ -380,10 +388,7 @@ def compensate_rolling_shutter(
         late,
         velocity.linear,
         velocity.angular,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
+        intrinsics_of(camera),
     )
     grid = CellGrid.of(xy, camera.width, camera.height)
     return replace(observations, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
@@ -396,12 +401,21 @@ def _compensated(
     late: Array,
     linear: Array,
     angular: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    camera: Intrinsics,
 ) -> tuple[Array, Array]:
-    """Pixels and depths of features that were exposed so many seconds after the middle row, as of that row's time."""
+    """Move features to where the camera of the middle row would have seen them.
+
+    Args:
+        xy: Measured pixels ``[N, 2]``.
+        z: Measured depths ``[N]``, metres, 0 missing.
+        late: Exposure of each feature's row after the middle one ``[N]``, seconds.
+        linear: Velocity ``[3]`` of the world in the camera frame, metres a second.
+        angular: Its angular velocity ``[3]``, radians a second.
+        camera: Intrinsics without distortion.
+
+    Returns:
+        Pixels ``[N, 2]`` and depths ``[N]``.
+    """
     xy = xy.copy()
     z = z.copy()
     # axis and angle per second
@@ -418,17 +432,21 @@ def _compensated(
         has_depth = z[i] > 0
         depth = z[i] if has_depth else 1.0
         travelled = late[i] if has_depth else 0.0
-        x = (xy[i, 0] - cx) / fx * depth - travelled * linear[0]
-        y = (xy[i, 1] - cy) / fy * depth - travelled * linear[1]
+        x = (xy[i, 0] - camera.cx) / camera.fx * depth - travelled * linear[0]
+        y = (xy[i, 1] - camera.cy) / camera.fy * depth - travelled * linear[1]
         depth -= travelled * linear[2]
         # Rodrigues' rotation by -late * angular
         cosine = np.cos(late[i] * speed)
         sine = -np.sin(late[i] * speed)
         along = (1 - cosine) * (ax * x + ay * y + az * depth)
+        right = cosine * x + sine * (ay * depth - az * y) + along * ax
+        down = cosine * y + sine * (az * x - ax * depth) + along * ay
         ahead = cosine * depth + sine * (ax * y - ay * x) + along * az
+
+        # project it
         if ahead > 0:
-            xy[i, 0] = (cosine * x + sine * (ay * depth - az * y) + along * ax) / ahead * fx + cx
-            xy[i, 1] = (cosine * y + sine * (az * x - ax * depth) + along * ay) / ahead * fy + cy
+            xy[i, 0] = right / ahead * camera.fx + camera.cx
+            xy[i, 1] = down / ahead * camera.fy + camera.cy
             if has_depth:
                 z[i] = ahead
     return xy, z
@@ -559,6 +577,7 @@ def trajectory(
     absolute = [frame.T_cam_ref @ slam_map.kf_pose[frame.reference] for frame in ordered]
     poses = np.array(absolute).reshape(-1, 4, 4)
 
+    # smoothed by the motion model, each pose by its information
     if settings.smooth and len(poses) > 2:
         covariances: list[Array] = []
         for pose, frame in zip(poses, ordered, strict=True):

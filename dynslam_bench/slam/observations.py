@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.features.matching import CellGrid, Words, as_words
 from dynslam_bench.geometry import Camera
+from dynslam_bench.slam.pose_optimisation import Measurements
 
 Array = NDArray[np.float64]
 
@@ -58,6 +59,15 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.xy)
+
+    def measurements(self, features: NDArray[np.integer]) -> Measurements:
+        """Measured places of some of the features ``[M]``, for the optimisation of poses."""
+        return Measurements(
+            self.xy[features],
+            self.right[features],
+            self.info[features],
+            self.info_right[features],
+        )
 
 
 def observe(

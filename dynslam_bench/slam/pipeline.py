@@ -143,9 +143,12 @@ class SlamPipeline:
         settings: Settings,
         cached: Mapping[str, CachedStage] | None = None,
     ) -> None:
+        # a filter that needs a flow has one, and a flow what refines the prediction with it
         needing = [f.name for f in filters if "flow" in f.needs]
         if needing and flow is None:
             raise TrackerError(f"filter '{needing[0]}' needs an optical flow, the system has none")
+
+        # the parts, in the order in which a frame passes them
         self._extractor = extractor
         self._mask_scheduler = mask_scheduler
         self._filters = tuple(filters)
@@ -156,13 +159,17 @@ class SlamPipeline:
         self._flow = flow
         self._refine_prediction = refine_prediction
         self._backend = backend
+
+        # settings of steps that are no part of their own
         self._guard: GuardSettings = getattr(settings, "guard", GuardSettings())
         self._segmentation: SegmentationSettings | None = getattr(settings, "segmentation", None)
+        # parts whose settings may change while a sequence runs
         self._online = OnlineSettings(settings, self._configurable_parts(settings))
         self._cached = dict(cached or {})
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence with the settings that the system was built with."""
+        # every part forgets the last sequence; one seed is drawn for all
         self._online.restore()
         self._camera = camera
         self._seed = derive_seed(rng)
@@ -231,6 +238,7 @@ class SlamPipeline:
             filter_result.mask,
             keypoints.xy,
             filter_result.keep,
+            result.motion_covariance,
         )
 
     # ------------------------------------------------------------------ steps of a frame
@@ -242,9 +250,17 @@ class SlamPipeline:
         depth: NDArray[np.float32],
         clock: StageClock,
     ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
-        """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none."""
+        """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none.
+
+        Args:
+            frame: The frame.
+            gray: uint8 ``[H, W]``, its grey levels.
+            depth: float32 ``[H, W]`` metres, 0 missing.
+            clock: Times the stage.
+        """
         if self._mask_scheduler is None:
             return None, None
+        # masks now, or those of the last segmented frame moved to this one
         mask = None
         with clock("segmentation"):
             instances = self._mask_scheduler.masks_for(frame, gray, keyframe=self._keyframe_due)
@@ -294,7 +310,7 @@ class SlamPipeline:
     def _cull(
         self, frame: FrameBundle, state: FilterState, clock: StageClock
     ) -> tuple[FilterResult, Any]:
-        """Which keypoints are static, by all filters in order; the first that needs the flow starts it.
+        """Judge which keypoints are static, by all filters in order; the first that needs the flow starts it.
 
         Returns:
             The filters' common verdict. Its stats are every filter's, each name with the filter's
@@ -392,6 +408,7 @@ class SlamPipeline:
         result: TrackResult,
     ) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
+        # counts of the frame, of the back end and of each filter
         stats = {
             "keypoints": float(len(frame.xy)),
             "culled": float(np.count_nonzero(~filter_result.keep)),
@@ -401,6 +418,7 @@ class SlamPipeline:
             else float(filter_result.mask.mean()),
             **filter_result.stats,
         }
+        # a flow that did not run has 0 in each of its diagnostics
         flow_stats = {} if state.flow is None else state.flow.stats
         for name in getattr(self._flow, "stats_names", ()):
             stats[f"flow_{name}"] = flow_stats.get(name, 0.0)
@@ -460,6 +478,7 @@ class SlamPipeline:
         self, settings: Settings
     ) -> Iterator[tuple[str, Callable[[Any], None]]]:
         """Each group of the settings with the function of every part that takes it."""
+        # each group with the parts that it may configure
         parts: list[tuple[str, Any]] = []
         for dynamic_filter in self._filters:
             for group in getattr(dynamic_filter, "groups", (dynamic_filter.name,)):
@@ -490,6 +509,7 @@ class SlamPipeline:
 
 def _depth_at(keypoints: Keypoints, depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth ``[N]`` in metres at the nearest pixel of each keypoint; 0 missing."""
+    # the border pixel for keypoints at the edge
     height, width = depth.shape
     column, row = np.rint(keypoints.xy).astype(np.intp).T
     nearest = depth[row.clip(0, height - 1), column.clip(0, width - 1)]
@@ -555,10 +575,12 @@ def flow_to_previous(
         frame: This frame.
         state: With the keypoints that are left and both poses.
     """
+    # only the keypoints that are left are tracked, from where the motion model expects them
     kept = np.flatnonzero(state.keep)
     count = len(frame.xy)
     guess = predicted_flow(frame, state)[kept]
     result = flow.track(image, previous, frame.keypoints.xy[kept], guess=guess, seed=state.seed)
+    # back into rows of all keypoints
     xy = np.full((count, 2), np.nan, np.float32)
     cost = np.full(count, np.inf, np.float32)
     valid = np.zeros(count, bool)
@@ -569,7 +591,7 @@ def flow_to_previous(
 
 
 def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32]:
-    """Where the motion model expects this frame's keypoints in the previous image.
+    """Places in the previous image where the motion model expects this frame's keypoints.
 
     Args:
         frame: The current frame.

@@ -40,6 +40,8 @@ MEDIAN_CHI2 = 1.386
 """Median of chi-square with two degrees of freedom."""
 LEAST_VARIANCE = 0.01
 """The residuals' variance is at least this share of the assumed one."""
+COVARIANCE_FACTOR = 1.0
+"""Calibrated factor on the covariance of a pose: residuals do not show all errors of the map that it is fitted to."""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane are never inliers."""
 MIN_POINTS = 6
@@ -114,6 +116,23 @@ class PoseEstimate:
     information: Array
 
 
+def motion_covariance(estimate: PoseEstimate) -> Array | None:
+    """Covariance ``[6, 6]`` of the motion to a pose from the frame before it; None if it is not determined.
+
+    It is the inverse of the pose's information, scaled by the variance of the residuals over the
+    assumed one, and by `COVARIANCE_FACTOR`. The frame before and the map count as known.
+    ``exp(xi) T_cam_world`` is ``T_world_cam exp(-xi)`` seen from the other side, so that the
+    matrix is that of a right perturbation of ``T_prev_cur``, too.
+    """
+    variance = max(estimate.residual_px**2 / MEDIAN_CHI2, LEAST_VARIANCE)
+    try:
+        covariance = np.linalg.inv(estimate.information)
+    except np.linalg.LinAlgError:
+        return None
+    scaled = COVARIANCE_FACTOR * variance * covariance
+    return np.asarray(0.5 * (scaled + scaled.T))
+
+
 @kernel
 def cauchy_width(chi2: Array) -> float:
     """Squared width of Cauchy's kernel for observations with these chi-squares.
@@ -121,12 +140,14 @@ def cauchy_width(chi2: Array) -> float:
     Their variance over the assumed one is estimated by the median of those that are finite (of
     points in front of the camera).
     """
+    # chi-squares of points in front of the camera
     finite = np.empty(len(chi2))
     count = 0
     for value in chi2:
         if np.isfinite(value):
             finite[count] = value
             count += 1
+    # the median is robust against outliers: it exceeds that of pure noise as the variance does
     if count == 0:
         return CAUCHY
     return CAUCHY * max(median(finite[:count]) / MEDIAN_CHI2, LEAST_VARIANCE)
@@ -146,6 +167,16 @@ def _linearise(
     """Fill the Gauss-Newton system ``h x = g`` ``[6, 6]``, ``[6]`` of the active points; returns the cost.
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        points: World points ``[N, 3]``, metres.
+        measured: Where the image shows them.
+        active: bool ``[N]``, points that count.
+        width: Squared width of Cauchy's kernel; 0 for Huber's.
+        camera: Intrinsics.
+        h: Filled with the Gauss-Newton matrix, lower triangle.
+        g: Filled with the gradient.
     """
     h[:] = 0.0
     g[:] = 0.0
@@ -246,14 +277,27 @@ def observation_chi2(
     info_right: float,
     camera: Intrinsics,
 ) -> tuple[float, float]:
-    """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
+    """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        point: World point ``[3]``, metres.
+        uv: Undistorted pixel ``[2]`` that shows it.
+        right: Its right coordinate; ignored where `info_right` is 0.
+        info: Inverse variance of the pixel, 1/px^2.
+        info_right: Inverse variance of the right coordinate, 0 without depth.
+        camera: Intrinsics.
+    """
+    # the point in the camera frame
     x, y, z = transform_point(pose, point)
     if z < NEAR_M:
         return np.inf, np.inf
+    # residuals of the pixel, weighted by their information
     u = camera.fx * x / z + camera.cx
     du = uv[0] - u
     dv = uv[1] - (camera.fy * y / z + camera.cy)
     pixel = info * (du * du + dv * dv)
+    # with depth the right coordinate, u less the disparity, counts, too
     if info_right <= 0.0:
         return pixel, pixel
     dr = right - (u - camera.bf / z)
@@ -272,8 +316,17 @@ def _classify(
     """Fill which observations fit, ``[N]``, and their reprojection errors ``[N]`` in standard deviations.
 
     Returns how many fit.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        points: World points ``[N, 3]``.
+        measured: Where the image shows them.
+        camera: Intrinsics.
+        inlier: Filled.
+        error: Filled; infinite behind the camera.
     """
     count = 0
+    # chi-square tests at 95 %, with two degrees of freedom or, with depth, three
     for i in range(points.shape[0]):
         pixel, whole = observation_chi2(
             pose,
@@ -299,7 +352,17 @@ def _optimise(
     rounds: int,
     iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:
-    """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``."""
+    """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``.
+
+    Args:
+        pose: World to camera ``[4, 4]`` to start from.
+        points: World points ``[N, 3]``.
+        measured: Where the image shows them.
+        camera: Intrinsics.
+        rounds: Optimisations, each followed by a new sorting into inliers and outliers.
+        iterations: Steps a round at most.
+    """
+    # every point is an inlier at first
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))
     chi2 = np.empty(len(points))
@@ -312,6 +375,8 @@ def _optimise(
             for i in range(len(points)):
                 chi2[i] = error[i] * error[i] if inlier[i] else np.inf
             width = cauchy_width(chi2)
+
+        # Levenberg-Marquardt on the inliers of the last round
         damping = DAMPING
         cost = _linearise(pose, points, measured, inlier, width, camera, h, g)
         for _ in range(iterations):
@@ -351,24 +416,18 @@ def _optimise(
 def optimise_pose(
     T_cam_world: Array,
     points: Array,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
+    measured: Measurements,
     camera: Camera,
     *,
     rounds: int = 4,
     iterations: int = 6,
 ) -> PoseEstimate:
-    """The world-to-camera pose that fits the points to the pixels, and which of them fit.
+    """Fit the world-to-camera pose to the pixels of known points, and tell which of them fit.
 
     Args:
         T_cam_world: Where to start ``[4, 4]``.
         points: World points ``[N, 3]``, metres.
-        uv: Undistorted pixels ``[N, 2]``.
-        right: Right coordinates ``[N]``; ignored where `info_right` is 0.
-        info: Inverse variances of the pixels ``[N]``, 1/px^2.
-        info_right: Inverse variances of the right coordinates ``[N]``, 0 without depth.
+        measured: Where the image shows them.
         camera: Intrinsics and baseline.
         rounds: Optimisations, each followed by a new sorting into inliers and outliers.
         iterations: Gauss-Newton steps a round at most.
@@ -378,12 +437,13 @@ def optimise_pose(
     """
     if len(points) < MIN_POINTS:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
+    # compiled loops take contiguous arrays
     start = np.ascontiguousarray(T_cam_world, np.float64)
-    measured = Measurements(*map(np.ascontiguousarray, (uv, right, info, info_right)))
+    contiguous = Measurements(*map(np.ascontiguousarray, measured))
     pose, inliers, error, h = _optimise(
         start,
         np.ascontiguousarray(points),
-        measured,
+        contiguous,
         intrinsics_of(camera),
         rounds,
         iterations,

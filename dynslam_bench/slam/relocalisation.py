@@ -91,8 +91,8 @@ MAX_SPLIT_SPREAD = 0.01
 ALIASING_CANDIDATES = 12
 """Best-ranked keyframes of each submap that are tested for aliasing."""
 ALIASING_SHARE = 0.33
-"""What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
-repeated walls 0.4 to 1 (rendered buildings)."""
+"""Share of the first place's matches from which a second place looks like it, too. Without repetition it is 0.15 at
+most, with repeated walls 0.4 to 1 (rendered buildings)."""
 SAME_PLACE_DEPTHS = 0.3
 """Poses farther apart, in median depths of what is seen, are two places."""
 SAME_PLACE_ANGLE = np.radians(15.0)
@@ -184,9 +184,11 @@ def _substrings(descriptors: Words) -> NDArray[np.uint16]:
 
 def _index_substrings(slam_map: Map) -> None:
     """Sort the substrings of new keyframes, and of those that have gained or lost many points."""
+    # features of each keyframe that observe a point: their descriptors are indexed
     observed = np.count_nonzero(slam_map.kf_point >= 0, axis=1)
     for slot in np.flatnonzero(slam_map.kf_alive).tolist():
         keyframe, substrings = slam_map.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
+        # a slot may hold another keyframe than it did, or one that was observed more since
         new = keyframe != slam_map.kf_id[slot]
         count = substrings.shape[1]
         if new or abs(observed[slot] - count) > CHANGED * count:
@@ -219,8 +221,10 @@ def _sum_weights(substrings: NDArray[np.uint16], weight: NDArray[np.float64]) ->
 
 def match_keyframe(slam_map: Map, keyframe: int, observations: Observations) -> Matches:
     """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
+    # rows of the keyframe's features that observe a point
     point = slam_map.kf_point[keyframe, : slam_map.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
+    # mutual nearest descriptors, clearly nearer than the second ones
     feature, row = match_brute_force(
         observations.descriptors,
         slam_map.kf_descriptor[keyframe, rows],
@@ -247,6 +251,7 @@ def ransac_pose(
         The world-to-camera pose with the most inliers and its inliers; None if no sample gave one
         with four.
     """
+    # a sample of three fits itself: an inlier more is the least that counts
     n = len(position)
     best: tuple[Array, NDArray[np.bool_]] | None = None
     best_count = 3
@@ -319,8 +324,18 @@ def _ransac_place(
     rng: np.random.Generator,
     min_inliers: int,
 ) -> InitialPose | None:
-    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
+    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it.
+
+    Args:
+        slam_map: The map.
+        keyframe: Slot of the keyframe.
+        observations: The frame's features.
+        matches: Its matches with the keyframe's map points.
+        rng: Draws the samples.
+        min_inliers: Inliers that are needed.
+    """
     feature = matches.feature
+    # reprojection errors by the features' own information
     ransac = ransac_pose(
         matches.position, observations.xy[feature], observations.info[feature], slam_map.camera, rng
     )
@@ -389,6 +404,7 @@ def verify_place(
         observations: The frame's features.
         settings: Radius and descriptor distances.
     """
+    # start from the matches that agree on the candidate
     keyframe = candidate.keyframe
     matches = candidate.matches
 
@@ -453,7 +469,7 @@ def recognise_place(
 def pose_uncertainty(
     slam_map: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
 ) -> float:
-    """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
+    """Uncertainty of the pose by the matches, e.g. those on one distant poster; up to 1 is precise enough.
 
     The number of matches says nothing of that: errors of the map are common to all of them. So they
     have to be well spread, and any half has to give the pose, so that a few far off the others do
@@ -489,6 +505,7 @@ def pose_uncertainty(
     centres = se3.inverse(poses)[:, :3, 3]
     spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
 
+    # the worse of the two, in median depths of the place
     worst = float(max(dilution / MAX_DILUTION, spread / MAX_SPLIT_SPREAD) / place.depth)
     return worst if np.isfinite(worst) else np.inf
 
@@ -504,6 +521,7 @@ def keyframe_neighbourhood(slam_map: Map, keyframe: int) -> Slots:
 
 def are_different_places(one: InitialPose, other: InitialPose) -> bool:
     """Whether a frame cannot have been taken at both places."""
+    # transform from the one camera to the other
     between = one.T_cam_world @ se3.inverse(other.T_cam_world)
     far = np.linalg.norm(between[:3, 3]) > SAME_PLACE_DEPTHS * max(one.depth, other.depth)
     return bool(far or se3.rotation_angle(between) > SAME_PLACE_ANGLE)
@@ -530,6 +548,7 @@ def is_aliased(
         possible: Called with a submap's number and ``T_cam_world``; False where the camera cannot be
             (`MotionBound.admits`).
     """
+    # a second place must show nearly as much of what it should as the first
     min_share = ALIASING_SHARE * max(place.seen_share for place in hypotheses.values())
     for submap in np.unique(slam_map.kf_map[keyframes]).tolist():
         places = [hypotheses[submap]] if submap in hypotheses else []
@@ -619,6 +638,7 @@ class RotationEstimate:
 
     def applied(self, T_last_world: Array) -> Array:
         """The world-to-camera pose ``[4, 4]`` of the last tracked frame, rotated about its centre."""
+        # the centre stays where the whole upper part [R t] is rotated from the left
         pose = T_last_world.copy()
         pose[:3] = self.R_now_last @ T_last_world[:3]
         return pose
@@ -631,6 +651,7 @@ class RotationEstimate:
             T_now_world: World-to-camera pose ``[4, 4]`` now.
             more: How far the two worlds may be rotated against each other, radians.
         """
+        # rotation left between the pose and the one that the images predict
         difference = T_now_world @ se3.inverse(self.applied(T_last_world))
         return bool(se3.rotation_angle(difference) <= self.slack + more)
 
@@ -659,11 +680,14 @@ class MotionBound:
 
     def admits(self, submap: int, T_cam_world: Array) -> bool:
         """Whether the camera can be at a world-to-camera pose in a submap."""
+        # the rotation agrees with the images, up to what the submaps may be rotated by
         slack = self.atlas.slack(self.atlas.active, submap)
         if self.rotation is not None and not self.rotation.allows(
             self.T_last_world, T_cam_world, slack
         ):
             return False
+
+        # the distance can have been covered
         last_centre = se3.inverse(self.T_last_world)[:3, 3]
         centre = se3.inverse(T_cam_world)[:3, 3]
         return self.atlas.reachable(self.atlas.active, submap, last_centre, centre, self.distance_m)
@@ -697,6 +721,7 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
+        # a well-tracked camera that sees something else at once was kidnapped
         points = int((last.point >= 0).sum())
         self._kidnapped = self.rotation is None and textured and points >= KIDNAP_POINTS
 
@@ -858,6 +883,7 @@ class PoseSearch:
             return replace(place, uncertainty=0.0)
 
         # the matches determine the pose well
+        # a lost camera's place has to pass two more tests
         rng = stream(self.seed, "halves", self.frame)
         uncertainty = pose_uncertainty(slam_map, observations, place, rng)
         if uncertainty > 1:

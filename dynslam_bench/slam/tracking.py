@@ -331,18 +331,17 @@ def solve(
     *,
     rounds: int = 4,
 ) -> PoseEstimate:
-    """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one."""
-    feature = matches.feature
-    return optimise_pose(
-        T_cam_world,
-        matches.position,
-        observations.xy[feature],
-        observations.right[feature],
-        observations.info[feature],
-        observations.info_right[feature],
-        camera,
-        rounds=rounds,
-    )
+    """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one.
+
+    Args:
+        camera: Intrinsics without distortion.
+        observations: The frame's features.
+        matches: Which of them show which world points.
+        T_cam_world: Pose to start from.
+        rounds: Optimisations, each followed by a new sorting into inliers and outliers.
+    """
+    measured = observations.measurements(matches.feature)
+    return optimise_pose(T_cam_world, matches.position, measured, camera, rounds=rounds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,7 +366,16 @@ class MapFit:
 def fit_pose(
     camera: Camera, observations: Observations, matches: Matches, T_cam_world: Array, in_view: Slots
 ) -> MapFit:
-    """Fit the pose to matches with the local map."""
+    """Fit the pose to matches with the local map.
+
+    Args:
+        camera: Intrinsics without distortion.
+        observations: The frame's features.
+        matches: Which of them show which points.
+        T_cam_world: Pose ``[4, 4]`` to start from.
+        in_view: Slots of the map points that should be in view.
+    """
+    # points that only the last frame's depth gives are no observations of the map
     estimate = solve(camera, observations, matches, T_cam_world)
     inliers = estimate.inliers & (matches.point >= 0)
     return MapFit(matches, estimate, in_view, inliers, int(np.count_nonzero(inliers)))
@@ -401,6 +409,7 @@ def track_local_map(
     mapped = matches.point >= 0
     if np.count_nonzero(mapped) >= 2 * settings.min_inliers:
         matches = matches.select(mapped)
+    # the pose by all matches
     return fit_pose(slam_map.camera, observations, matches, T_cam_world, in_view)
 
 
@@ -469,6 +478,7 @@ def weakly_connected(slam_map: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) 
 
 def _long_ago(slam_map: Map, keyframe: int, gap: int, connected: Slots) -> Slots:
     """Slots of the keyframes made `gap` before or after one, or longer, without the connected; all of other submaps."""
+    # made long before or after, and not connected; or in another submap
     long_ago = np.abs(slam_map.kf_id - slam_map.kf_id[keyframe]) >= gap
     long_ago[connected] = False
     return np.flatnonzero(

@@ -1,4 +1,4 @@
-"""What is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
+"""Report on what is installed here and what is missing: packages, extras, weights, sequences, folders, plug-ins."""
 
 import platform
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from dynslam_bench.core import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
 from dynslam_bench.segmentation.networks.checkpoints import (
-    COCO,
+    CHECKPOINTS,
     cached_checkpoint,
     embedded_weights,
 )
@@ -57,7 +57,7 @@ def examine() -> list[Finding]:
 
 
 def _recordings() -> Finding:
-    """How many recorded sequences there are."""
+    """Number of recorded sequences."""
     here = [summary["id"] for summary in summaries() if summary["here"]]
     count = sum(not name.startswith("synthetic/") for name in here)
     state = f"{count} in {find_data_root()}"
@@ -114,20 +114,24 @@ def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
 
 def _weights() -> list[Finding]:
     """The weights of the networks for masks: those of the package, and those that are fetched."""
-    coco = cached_checkpoint(COCO)
-    if coco:
-        fetched = Finding("weights", "coco", str(coco))
-    else:
-        size = f"{COCO.megabytes} MB, fetched when first used"
-        hint = f"{size}, or put {COCO.url} into {weights_folder()}"
-        fetched = Finding("weights", "coco", "not here", True, hint)
+    findings = []
     if embedded_weights().is_file():
-        return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
-    return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
+        findings.append(Finding("weights", "embedded", "in the package, for rendered people"))
+    else:
+        findings.append(Finding("weights", "embedded", "missing", True, "reinstall"))
+    for checkpoint in CHECKPOINTS.values():
+        path = cached_checkpoint(checkpoint)
+        if path:
+            findings.append(Finding("weights", checkpoint.id, str(path)))
+        else:
+            size = f"{checkpoint.megabytes:g} MB, {checkpoint.license}, fetched when first used"
+            hint = f"{size}, or put {checkpoint.url} at {weights_folder() / checkpoint.file}"
+            findings.append(Finding("weights", checkpoint.id, "not here", True, hint))
+    return findings
 
 
 def _torch_device() -> Finding:
-    """Which device ``--device auto`` takes; loads torch, which takes a second or two."""
+    """Find the device that ``--device auto`` takes; loads torch, which takes a second or two."""
     import torch
 
     device = f"cpu, {torch.get_num_threads()} processor threads"

@@ -19,7 +19,7 @@ from dynslam_bench.runs.spec import Limits
 from dynslam_bench.testing.report import Check, ConformanceReport
 
 _WORK = "dynslam_bench.testing.isolated:work"
-"""What a child runs."""
+"""The function that a child runs."""
 _CAUSES = {
     "crashed": "os._exit, exit() or a fault in a library that the tracker calls",
     "timeout": "an endless loop or a lock; --time-limit gives slow trackers more time",

@@ -26,7 +26,7 @@ OPTIONS = {
     "filter": "a dynamic filter: module:Attr or file.py:Attr of a class or function that constructs it",
     "sequence": "a sequence: id, folder, or module:Attr or file.py:Attr of a DatasetSpec (the first that it lists)",
 }
-"""What can be checked: the end of the option's name, and its help."""
+"""Plug-ins that can be checked: the end of the option's name, and its help."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -75,7 +75,7 @@ class ConformanceItem(pytest.Item):
             pytest.fail(self.check.message, pytrace=False)
 
     def reportinfo(self) -> tuple[str, None, str]:
-        """Where the item stands, for pytest's output."""
+        """Location of the item, for pytest's output."""
         return "dynslam-bench", None, f"check of {self.name}"
 
 

@@ -67,7 +67,7 @@ _MEMBERS = (
     "digest",
     "__len__",
 )
-"""What a sequence has beside its frames."""
+"""Members that a sequence has beside its frames."""
 
 
 def _protocol(sequence: Sequence) -> None:
@@ -236,7 +236,7 @@ def _digest(sequence: Sequence) -> None:
 
 
 def _pickling(sequence: Sequence) -> None:
-    """A pickled copy is the same sequence: workers get it so."""
+    """Check that a pickled copy is the same sequence: workers get it so."""
     copy = pickle.loads(pickle.dumps(sequence))
     require(
         len(copy) == len(sequence) and copy.digest() == sequence.digest(),

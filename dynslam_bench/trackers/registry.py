@@ -70,11 +70,11 @@ class TrackerRegistry(Registry[TrackerSpec]):
         if separator and self.find(name) is None:
             spec = self.find(prefix)
             if spec is not None and spec.parameter:
-                return _bind(spec, value)
+                return _with_value(spec, value)
         return super().get(name)
 
 
-def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
+def _with_value(spec: TrackerSpec, value: str) -> TrackerSpec:
     """The spec of ``id:value``; what a named file says becomes part of the version, and so of a run's identity."""
     if not value.strip():
         raise PluginError(
@@ -92,19 +92,19 @@ def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
         fields["version"] += f"+{sha256(content).hexdigest()[:12]}"
     fields["id"] = f"{spec.id}:{value}"
     fields["parameter"] = ""
-    return replace(spec, **fields, bound={**spec.bound, spec.parameter: value})
+    return replace(spec, **fields, fixed_settings={**spec.fixed_settings, spec.parameter: value})
 
 
 TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, all_specs)
 
 
 def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = None) -> Settings:
-    """The tracker's default settings, with the values that its id binds, then the overrides (dotted name to value).
+    """The default settings with those that the id fixes, then the overrides (dotted name to value).
 
     Raises:
         SettingsError: Unknown name, unfit value, or values that do not go together.
     """
-    settings = apply_overrides(spec.settings(), {**spec.bound, **(overrides or {})})
+    settings = apply_overrides(spec.settings(), {**spec.fixed_settings, **(overrides or {})})
     settings.verify()
     return settings
 

@@ -1,4 +1,4 @@
-"""What the agents share: the environment with a memory, and the score of an episode."""
+"""Parts that the agents share: the environment with a memory, and the score of an episode."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

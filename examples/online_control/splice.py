@@ -1,4 +1,4 @@
-"""What hindsight reaches: of a few static settings, the best one for every stretch of the episode.
+"""Score that hindsight reaches: of a few static settings, the best one for every stretch of the episode.
 
 At every stretch a copy of the episode tries each of the settings, and the one that earns most is
 taken. This is no agent, because it knows the rewards before it acts, and no upper bound, because it

@@ -113,7 +113,7 @@ def _entry_group(board: Board, key: str) -> int:
 def _run_cells(
     board: Board, key: str, cells: Mapping[str, TableCell], paged: Collection[str]
 ) -> dict[str, Any]:
-    """What follows from a tracker's runs alone: name and origin, success, coverage, time and memory.
+    """Cells that a tracker's runs alone decide: name and origin, success, coverage, time and memory.
 
     Args:
         board: The board.
@@ -190,7 +190,8 @@ def _verdict_cell(board: Board, standing: Standing | None, cell: TableCell) -> T
     tip = "" if standing.p_value is None else f"p {standing.p_value:.2g}, Holm-corrected"
     if standing.verdict == "cannot tell":
         more = more_sequences(board, standing.key)
-        settle = f"about {more} more sequences would settle it" if more else ""
+        plural = "" if more == 1 else "s"
+        settle = f"about {more} more sequence{plural} would settle it" if more else ""
         return replace(cell, small="; ".join(filter(None, [settle, small])), tip=tip)
     text = f"{cell.text} {standing.scope}".strip()
     return replace(cell, text=text, small=small, tip=tip)
@@ -262,7 +263,7 @@ def board_data(
     pictured: set[str],
     pageless: str,
 ) -> dict[str, Any]:
-    """What ``data/board.js`` holds: trackers, sequences, cells and runs.
+    """Content of ``data/board.js``: trackers, sequences, cells and runs.
 
     Cells and runs name trackers and sequences by their positions in these lists.
 
@@ -353,7 +354,7 @@ def _sequences_data(board: Board, names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def ratios_data(board: Board) -> list[list[Any]]:
-    """What ``data/ratios.js`` holds of every two trackers: their numbers, and the second against the first.
+    """Content of ``data/ratios.js``: for every two trackers their numbers, and the second against the first.
 
     Two positions of trackers, ratio and ends of its interval, number of sequences, verdict and its scope.
     """
@@ -432,7 +433,7 @@ def cell_data(
 
 
 def settings_data(row: RunRow) -> dict[str, str]:
-    """What sets a run's tracker apart from other variants of it."""
+    """Settings that set a run's tracker apart from other variants of it."""
     return {name: setting_text(value) for name, value in row.variant.items()}
 
 

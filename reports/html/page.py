@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
-from dynslam_bench.reports.html.still import still
+from dynslam_bench.reports.html.static_chart import static_chart
 from dynslam_bench.reports.tables.table import Table
 
 ASSETS = "assets"
@@ -96,7 +96,7 @@ def _templates() -> Environment:
         "breakable": _breakable,
         "script": to_script,
         "figure": figure_json,
-        "still": still,
+        "static_chart": static_chart,
     }
     return environment
 
@@ -156,7 +156,7 @@ def figure_json(figure: go.Figure) -> Markup:
 
 
 def read_remark(output: Path, name: str) -> Any:
-    """What stands in the first line of ``data/<name>.js``, see `write_side`; None without that file."""
+    """Read the first line of ``data/<name>.js``, see `write_side`; None without that file."""
     with (
         suppress(OSError, ValueError),
         (output / FOLDER / f"{name}.js").open(encoding="utf-8") as file,

@@ -1,1 +1,1 @@
-"""What a report knows: rows, the board, statistics, published numbers."""
+"""The data of a report: rows, the board, statistics, published numbers."""

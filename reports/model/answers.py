@@ -1,14 +1,15 @@
-"""What a board answers in millimetres: the typical error of each tracker, a sentence per category, and its limits."""
+"""Answers of a board in millimetres: the typical error of each tracker, a sentence per category, and its limits."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence
+from dynslam_bench.core.number_text import mm
+from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence, mean_of
 from dynslam_bench.reports.model.row import SEEN, RunRow
-from dynslam_bench.reports.tables.table import mm
 from dynslam_bench.runs.rows import part_words
 
 MEANINGS = {
@@ -23,6 +24,10 @@ MEANINGS = {
     "rendered": "rendered scenes",
 }
 """Categories in everyday words."""
+NEARLY_ALL = 0.95
+"""Share of the ground truth's time from which nothing is said of it: it often goes on behind the last image."""
+_MOST_NAMED = 4
+"""Trackers that a sentence on failures names, those with the most first."""
 _BEST_NAMED = 2
 """Ranked trackers that an answer names, from the best on, beside the reference."""
 
@@ -68,7 +73,7 @@ def typical_error(board: Board, key: str, names: Sequence[str]) -> TypicalError:
 
 
 def error_columns(board: Board) -> dict[str, list[str]]:
-    """What moves, in everyday words, to the sequences that typical errors are over.
+    """Sequences that typical errors are over, by what moves in them, in everyday words.
 
     They are those that all ranked trackers have.
 
@@ -90,7 +95,7 @@ def error_columns(board: Board) -> dict[str, list[str]]:
 
 
 def answers(board: Board) -> list[str]:
-    """What a board says in millimetres, a sentence for each of its columns of errors; none without ground truth.
+    """Sentences on a board's errors in millimetres, one a column of errors; none without ground truth.
 
     Named are the ranked trackers with the smallest typical errors, the reference, and a camera that
     does not move. Where nothing is ranked, all trackers are compared.
@@ -135,14 +140,24 @@ def _words(board: Board, key: str, names: Sequence[str]) -> str:
         remarks.append("final trajectory")
     if error.sequences < error.asked:
         remarks.append(f"on {error.sequences}")
+    shares = [row.truth_share for name in names for row in _rows(board, key, name)]
+    share = mean_of(shares)
+    if share is not None and share < NEARLY_ALL:
+        remarks.append(f"{100 * share:.0f} % of the time")
     if error.lost:
         remarks.append(f"lost {error.lost}")
     behind = f" ({', '.join(remarks)})" if remarks else ""
     return f"{board.names[key]} {mm(error.median_m)} mm{behind}"
 
 
+def _rows(board: Board, key: str, name: str) -> list[RunRow]:
+    """The runs of a tracker on a sequence."""
+    cell = board.cells[key].get(name)
+    return [] if cell is None else list(cell.rows)
+
+
 def limits(board: Board) -> str:
-    """What has to be said with the numbers of a board, in a few short sentences."""
+    """Limits of the numbers of a board, in a few short sentences."""
     rows = board.rows
     sentences = ["Medians over sequences of the absolute trajectory error."]
     sentences.append(_kind_of_data(rows))
@@ -151,10 +166,21 @@ def limits(board: Board) -> str:
         sentences.append("One run each: how far repeats lie apart is not known.")
     if any(row.seen_in_training for row in rows):
         sentences.append(f"{SEEN} Masks of a network that was trained on the very scene.")
-    failed = sum(row.failed for row in rows)
-    if failed:
-        sentences.append(f"{failed} of {len(rows)} runs failed, and count as not moving, or worse.")
-    return " ".join(sentences)
+    sentences.append(_failures_words(board))
+    return " ".join(filter(None, sentences))
+
+
+def _failures_words(board: Board) -> str:
+    """How many runs failed, and of which trackers; empty for none."""
+    failed = Counter(board.names[row.variant_key] for row in board.rows if row.failed)
+    if not failed:
+        return ""
+    named = [f"{name} {count}" for name, count in failed.most_common(_MOST_NAMED)]
+    if len(failed) > _MOST_NAMED:
+        named.append(f"{len(failed) - _MOST_NAMED} more trackers")
+    verb = "counts" if failed.total() == 1 else "count"
+    words = f"{failed.total()} of {len(board.rows)} runs failed ({', '.join(named)})"
+    return f"{words} and {verb} as not moving, or worse."
 
 
 def _kind_of_data(rows: Iterable[RunRow]) -> str:

@@ -51,7 +51,7 @@ from dynslam_bench.sequences.tags import FIXED_CAMERA
 from dynslam_bench.sequences.thumbnails import same_frames
 
 STATIC_CAMERA = "static camera (from ground truth)"
-"""What captions call the reference where it is a static camera."""
+"""Name in captions of the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
 """Tracker that errors are divided by where no other is asked for."""
 RankingBasis = Literal["common", "all"]
@@ -325,7 +325,7 @@ class Board:
 
             ``Float64`` columns:
 
-            - coverage and epipolar_skipped: shares, 0 to 1;
+            - coverage, truth_share (of imports whose frames are not known) and epipolar_skipped: shares, 0 to 1;
             - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
                 or worse;
             - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
@@ -566,7 +566,7 @@ def rank(
 
 
 def group_of(tags: Collection[str]) -> str:
-    """What moves in a scene, by the tags of its sequence."""
+    """Group of a scene: what moves in it, by the tags of its sequence."""
     return next((group for tag, group in _GROUPS.items() if tag in tags), _OTHER)
 
 
@@ -626,7 +626,7 @@ MOST_FURTHER = 500
 
 
 def more_sequences(board: Board, key: str) -> int | None:
-    """How many further sequences would tell a tracker from the reference, if the truth is what is measured here.
+    """Number of further sequences that would tell a tracker from the reference, if the truth is what is measured here.
 
     Returns:
         None where that cannot be said: without a reference or a scatter, or for more than
@@ -634,6 +634,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     """
     if board.reference is None or len(board.common) < FEWEST:
         return None
+    # log ratios of the errors on sequences that both have tracked
     logs = common_logs(board, [key, board.reference])
     lost = board.lost(key) | board.lost(board.reference)
     is_lost = np.array([name in lost for name in board.common], dtype=bool)
@@ -641,6 +642,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     differences = differences[~is_lost & np.isfinite(differences)]
     if len(differences) < FEWEST:
         return None
+    # the number of sequences that shows the measured gain at this scatter
     spread = float(differences.std(ddof=1))
     gain = 1.0 - math.exp(-abs(float(differences.mean())))
     n_tests = max(len(board.ranked) - 1, 1)
@@ -741,7 +743,7 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: the true poses are the same, or the pictures before a fixed camera.
+    """Find sequences that are copies of others: equal true poses, or equal pictures before a fixed camera.
 
     Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
@@ -801,7 +803,7 @@ def _is_same_path(row: RunRow, other: RunRow) -> bool:
 
 
 def copies_note(board: Board) -> str:
-    """Which sequences are one recording and count once, and why; empty where none are."""
+    """Note on sequences that are one recording and count once, and why; empty where none are."""
     names = grouped(board.copies, board.copies.__getitem__)
     shown = [
         f"{first} counts once for {', '.join([first, *others])}" for first, others in names.items()
@@ -868,7 +870,7 @@ def _each_once(board: Board, names: Sequence[str]) -> list[str]:
 
 
 def _most_cells(sequences: Sequence[set[str]]) -> int:
-    """How many trackers to rank so that trackers times common sequences is largest: several, where that is possible.
+    """Number of trackers to rank so that trackers times common sequences is largest: several, where that is possible.
 
     Args:
         sequences: The sequences of each tracker, most first.
@@ -938,7 +940,7 @@ class TrackerOnSequence:
 
     @cached_property
     def ending(self) -> str:
-        """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
+        """Words on how the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
         if len(endings) > 1:
             return f"{self.failed} failed: {'; '.join(endings)}"
@@ -957,7 +959,7 @@ def make_cell(rows: Sequence[RunRow]) -> TrackerOnSequence:
 
 
 def _result_of(row: RunRow) -> tuple[object, ...]:
-    """How a run ended, and all its errors; equal for copies."""
+    """Status and all errors of a run; equal for copies."""
     errors = (row.score_m, row.final_ate_m, *sorted(row.metrics.items()))
     return (row.status, row.n_processed, row.coverage, *errors)
 
@@ -969,7 +971,7 @@ def timed(runs: Sequence[RunRow]) -> list[RunRow]:
 
 
 def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
-    """The runs whose times count: of those with frame times the ones on one computer.
+    """The runs whose times are compared: those with frame times that one computer has made.
 
     Args:
         runs: Some runs.
@@ -979,6 +981,11 @@ def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
     if computer in by_computer:
         return by_computer[computer]
     return max(by_computer.values(), key=lambda rows: (len(rows), rows[0].computer), default=[])
+
+
+def mean_coverage(rows: Sequence[RunRow]) -> tuple[float | None, float | None]:
+    """Mean coverage of runs, and the mean share of the truth's time of those whose frames are not known."""
+    return mean_of(row.coverage for row in rows), mean_of(row.truth_share for row in rows)
 
 
 def mean_of(values: Iterable[float | None]) -> float | None:
@@ -1098,6 +1105,7 @@ _COLUMNS = {
     ),
     "Float64": (
         "coverage",
+        "truth_share",
         "score_m",
         "hold_last_pose_ate_m",
         "final_ate_m",

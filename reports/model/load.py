@@ -23,7 +23,7 @@ from dynslam_bench.runs.store import RunStore, open_store, warn_of_unreadable
 OnProgress = Callable[[float, float | None, str], None]
 """Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
 _ROW_CODE = (f"{PACKAGE}.reports.model.row",)
-"""What rows are computed by, with all that it uses."""
+"""Modules that compute rows, with all that they use."""
 
 
 def no_progress(done: float, total: float | None, what: str) -> None:
@@ -275,7 +275,7 @@ def trial_words(count: int) -> str:
 
 
 def _conflicting_results(rows: Iterable[RunRow]) -> list[str]:
-    """Which runs of one id from several stores have different results although they should be equal, in words."""
+    """Describe runs of one id from several stores whose results differ although they should be equal."""
     conflicts = []
     for same_run in grouped(rows, lambda row: row.run_id).values():
         first = same_run[0]

@@ -1,4 +1,4 @@
-"""What the columns of a table are called: as short as tells them apart, parts always marked."""
+"""Names of the columns of a table: as short as tells them apart, parts always marked."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -110,7 +110,7 @@ OUR_OWN = ", our own"
 ALWAYS = ("map", "backend.map.localisation_only")
 """Named in any table: a run that begins in a map knows more than one that begins without."""
 OF_ALL = {"device", "threads"}
-"""What every run has a value of, asked for or not."""
+"""Settings that every run has a value of, asked for or not."""
 
 
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:

@@ -38,7 +38,7 @@ METRICS = (
     "rpe_1s_rot_rmse_deg",
     "coverage_percent",
 )
-"""What was published of a sequence, the error that is always sought first."""
+"""Metrics of published numbers, the error that is always sought first."""
 NOT_STATED = "not stated"
 """In place of what a source does not say."""
 RECORD = "record"
@@ -54,7 +54,7 @@ HOW = {
     "S": "second-hand: another paper's table or notes",
     "I": "inferred",
 }
-"""How a record is known, to its words."""
+"""Words for the form in which a record is known, by its letter."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def published() -> pd.DataFrame:
 
 
 def published_for(sequences: Sequence[str], protocol: Protocol | None = None) -> pd.DataFrame:
-    """What was published of whole sequences, a line for every system and source, the lowest ATE of a sequence first.
+    """Published numbers of whole sequences, a line a system and source, the lowest ATE of a sequence first.
 
     Args:
         sequences: Ids of the sequences.
@@ -184,7 +184,7 @@ def static_camera_errors() -> dict[tuple[str, str], float]:
 
 
 def least_length_s(sequence: str) -> float | None:
-    """How long a published recording lasts at least, in seconds; None where that is not known."""
+    """Least duration of a published recording, in seconds; None where that is not known."""
     frames = _LEAST_FRAMES.get(sequence)
     return None if frames is None else frames / 30.0
 

@@ -1,4 +1,4 @@
-"""What a board says in words: one sentence, and one paragraph for readers without statistics."""
+"""Summary of a board in words: one sentence, and one paragraph for readers without statistics."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -49,7 +49,8 @@ def headline(board: Board) -> str:
         return f"{where}{board.reference_name} lost all, so no tracker can be compared with it."
     if not claimed:
         n_worse = sum(standing.verdict == "worse" for standing in ranked)
-        return f"{where}no tracker is shown to be better than {board.reference_name}; {_are(n_worse)} worse."
+        worse = f"; {_are(n_worse)} worse" if n_worse else ""
+        return f"{where}no tracker is shown to be better than {board.reference_name}{worse}."
     return f"{where}{claimed}."
 
 
@@ -58,7 +59,7 @@ def _reference_lost_all(board: Board) -> bool:
 
 
 def _better_words(board: Board, ranked: list[Standing]) -> str:
-    """Which trackers are better than the reference, how far that goes, and what may be the best; empty for none."""
+    """Words on the trackers that are better than the reference, and how far that goes; empty for none."""
     better = [standing for standing in ranked if standing.verdict == "better"]
     if not better:
         return _but_lost_words(board, ranked)
@@ -106,7 +107,7 @@ def _but_lost_words(board: Board, ranked: list[Standing]) -> str:
 
 
 def explanation(board: Board) -> str:
-    """How to read the board, for a reader without statistics; empty where nothing is ranked."""
+    """Sentences on reading the board, for a reader without statistics; empty where nothing is ranked."""
     if not board.common or not board.ranked:
         return ""
     if len(board.common) < FEWEST:
@@ -146,7 +147,7 @@ def _can_claim(board: Board) -> bool:
 
 
 def _missing_words(board: Board) -> str:
-    """What claims beyond these families would need, and where there are too few sequences claims on them."""
+    """Words on what claims beyond these families would need, and claims on them where there are too few sequences."""
     n_families = len(set(board.ranked_sequences.families))
     families = "family" if n_families == 1 else "families"
     here = f"here {'is' if n_families == 1 else 'are'} {n_families}"
@@ -160,7 +161,7 @@ def _missing_words(board: Board) -> str:
 
 
 def _best_words(board: Board) -> str:
-    """Which trackers may be the best; empty where that is not known."""
+    """Words on the trackers that may be the best; empty where that is not known."""
     best = [standing for standing in board.standings if standing.may_be_best]
     if not best or not board.ranked_sequences.can_go_beyond or len(board.ranked) < 2:
         return ""
@@ -168,7 +169,7 @@ def _best_words(board: Board) -> str:
 
 
 def _resolution_words(board: Board) -> str:
-    """Which differences the board can show, and what it lacks for claims beyond its families."""
+    """Words on the differences that the board can show, and what it lacks for claims beyond its families."""
     these, beyond = board_resolution(board)
     scopes = []
     if these < 1.0:
@@ -186,7 +187,7 @@ def _resolution_words(board: Board) -> str:
 
 
 def reservations(rows: Sequence[RunRow]) -> list[str]:
-    """What speaks against quoting numbers of these runs, or has to be said with them; in sentences."""
+    """Reservations about quoting numbers of these runs, in sentences."""
     sentences = []
     cells = {(row.variant_key, row.sequence_key) for row in rows}
     if len(cells) == len(rows):
@@ -232,7 +233,7 @@ def mean_rank_note(board: Board) -> str:
 
 
 def _sequences(board: Board) -> str:
-    """How many sequences the ranking is over, and of which category."""
+    """Words on how many sequences the ranking is over, and of which category."""
     number = len(board.common)
     plural = "sequence" if number == 1 else "sequences"
     if board.category == "loops":

@@ -18,7 +18,7 @@ _IN_TABLE = {
 
 
 def published_table(lines: pd.DataFrame) -> Table | None:
-    """What was published of sequences, a row for every system and source; None without any.
+    """Table of published numbers, a row for every system and source; None without any.
 
     Args:
         lines: Lines of `published_for`: one for every system and source.

@@ -1,4 +1,4 @@
-"""What a paper or a post quotes of a board: a sentence, a LaTeX table that fits a column, and BibTeX entries."""
+"""Quotes of a board for a paper or a post: a sentence, a LaTeX table that fits a column, and BibTeX entries."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import dynslam_bench
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.model.answers import limits, typical_error
 from dynslam_bench.reports.model.board import Board
@@ -13,7 +14,6 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     escape_latex,
-    mm,
     numbers,
     texts,
     to_latex,

@@ -12,7 +12,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.flow.settings import DenseFlowSettings
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.slam.pose_optimisation import optimise_pose
+from dynslam_bench.slam.pose_optimisation import Measurements, optimise_pose
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 RECORDINGS = {
@@ -188,7 +188,7 @@ def _motion(first: Frame, second: Frame, motion: np.ndarray, camera: Camera) -> 
     uv = camera.undistort_points(xy2)[smooth]
     one = np.ones(smooth.sum())
     none = np.zeros(smooth.sum())
-    estimate = optimise_pose(motion, space[smooth], uv, none, one, none, camera)
+    estimate = optimise_pose(motion, space[smooth], Measurements(uv, none, one, none), camera)
     return estimate.T_cam_world if len(xy1) >= 50 and estimate.residual_px < 1.0 else None
 
 

@@ -27,7 +27,7 @@ from multiprocessing import get_context
 import psutil
 from command_line import parser_of
 
-from dynslam_bench.runs import Plan, RunSpec, RunStore, list_runs, run_many
+from dynslam_bench.runs import PlannedRuns, RunSpec, RunStore, list_runs, run_many
 from dynslam_bench.runs.cluster import DaskWorkers
 from dynslam_bench.runs.identity import Resolver
 from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE
@@ -88,7 +88,7 @@ def fill(folder: str, count: int, results: str) -> list[float]:
 def resume(folder: str, count: int, results: str) -> list[float]:
     """Look all up and take them from the store."""
 
-    def not_stored(plan: Plan) -> None:
+    def not_stored(plan: PlannedRuns) -> None:
         raise AssertionError(f"{plan.runs} of {count} runs were not found")
 
     began = time.process_time()

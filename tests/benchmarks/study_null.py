@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from command_line import parser_of
 from helpers import simulated
 
-from dynslam_bench.evaluation.verdicts import Verdict, verdict_of
+from dynslam_bench.evaluation.verdicts import ComparisonVerdict, verdict_of
 from dynslam_bench.tuning import distributions, finish
 from dynslam_bench.tuning.objectives import compare
 
@@ -63,7 +63,7 @@ def share(count: int, studies: int) -> str:
 
 def null(studies: int, folder: Path) -> Iterable[str]:
     """Shares of verdicts in studies in which nothing is better than the baseline."""
-    verdicts = [verdict.value for verdict in Verdict]
+    verdicts = [verdict.value for verdict in ComparisonVerdict]
     lucky = "the best trial promises a gain of 5 %, %"
     yield line(
         "scenes to tune on, to judge", "sd", lucky, *(f"*{verdict}*, %" for verdict in verdicts)
@@ -121,8 +121,8 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
                 counts[summary.verdict] += 1
                 held_out = tuner.design.held_out
                 known = compare(tuner.outcomes(optimum, held_out), tuner.outcomes({}, held_out))
-                counts["known"] += verdict_of(known) is Verdict.PROVEN
-            names = (Verdict.PROVEN, Verdict.PROMISING, "known")
+                counts["known"] += verdict_of(known) is ComparisonVerdict.PROVEN
+            names = (ComparisonVerdict.PROVEN, ComparisonVerdict.PROMISING, "known")
             shares = [share(counts[name], studies) for name in names]
             gain = f"{100 * np.mean(gains):.0f}"
             yield line(f"{tuned}, {judging}", simulated.STARTS_SD, gain, *shares)

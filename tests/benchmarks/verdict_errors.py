@@ -38,7 +38,7 @@ from dynslam_bench.evaluation.verdicts import (
     LOOKS,
     MARGIN,
     ONE_SIDED,
-    Verdict,
+    ComparisonVerdict,
     hodges_lehmann,
     interval_with_ties,
     paired_ratio,
@@ -160,7 +160,7 @@ WORLDS = {
 
 def judge(
     values: Array, lost: Array, lost_baseline: Array, one_sided: float = ONE_SIDED
-) -> Verdict:
+) -> ComparisonVerdict:
     """The verdict on simulated scenes."""
     names = np.array([str(number) for number in range(len(values))])
     log_ratios = dict(zip(names.tolist(), values.tolist(), strict=True))
@@ -168,7 +168,9 @@ def judge(
     return verdict_of(comparison)
 
 
-def share_of(verdict: Verdict, world: str, scenes: int, shift: float, simulations: int) -> float:
+def share_of(
+    verdict: ComparisonVerdict, world: str, scenes: int, shift: float, simulations: int
+) -> float:
     """How often a world whose typical log ratio is `shift` gets a verdict."""
     rng = np.random.default_rng([scenes, simulations, list(WORLDS).index(world)])
     studies = drawn_studies(rng, world, scenes, shift, simulations)
@@ -184,7 +186,9 @@ def drawn_studies(
     return np.array(values), np.array(lost), np.array(lost_baseline)
 
 
-def is_said_of(studies: tuple[Array, Array, Array], verdict: Verdict, level: float) -> Array:
+def is_said_of(
+    studies: tuple[Array, Array, Array], verdict: ComparisonVerdict, level: float
+) -> Array:
     """Which studies get a verdict ``[N]``.
 
     Raises:
@@ -204,7 +208,7 @@ def line(*cells: object) -> str:
     return f"| {' | '.join(texts)} |"
 
 
-def table_of_worlds(title: str, verdict: Verdict, shift: float, simulations: int) -> None:
+def table_of_worlds(title: str, verdict: ComparisonVerdict, shift: float, simulations: int) -> None:
     """One verdict in every world, by the number of scenes."""
     print(f"\n{title}\n")
     print(line("world", *(f"{scenes} scenes" for scenes in SCENES)))
@@ -217,19 +221,19 @@ def table_of_worlds(title: str, verdict: Verdict, shift: float, simulations: int
 def null(simulations: int) -> None:
     """*Proven* where nothing is better."""
     title = "*proven* where the typical ratio is 1, % (bar: 3.0; with three scenes none)"
-    table_of_worlds(title, Verdict.PROVEN, 0.0, simulations)
+    table_of_worlds(title, ComparisonVerdict.PROVEN, 0.0, simulations)
 
 
 def margin(simulations: int) -> None:
     """*No difference that matters* where the difference is the margin."""
     title = "*no difference that matters* where the typical ratio is 1.1, % (bar: 5)"
-    table_of_worlds(title, Verdict.NO_DIFFERENCE, math.log1p(MARGIN), simulations)
+    table_of_worlds(title, ComparisonVerdict.NO_DIFFERENCE, math.log1p(MARGIN), simulations)
 
 
 def power(simulations: int) -> None:
     """*Proven* where the candidate has 20 % less error."""
     title = "*proven* where the typical ratio is 0.8, %"
-    table_of_worlds(title, Verdict.PROVEN, math.log(0.8), simulations)
+    table_of_worlds(title, ComparisonVerdict.PROVEN, math.log(0.8), simulations)
 
 
 def extend(simulations: int) -> None:
@@ -248,10 +252,10 @@ def extend(simulations: int) -> None:
     print(line(*["---"] * 5))
     naive = dict.fromkeys(LOOKS, ONE_SIDED)
     cells = (
-        (0.0, LOOKS, Verdict.PROVEN),
-        (math.log(0.8), LOOKS, Verdict.PROVEN),
-        (math.log1p(MARGIN), LOOKS, Verdict.NO_DIFFERENCE),
-        (0.0, naive, Verdict.PROVEN),
+        (0.0, LOOKS, ComparisonVerdict.PROVEN),
+        (math.log(0.8), LOOKS, ComparisonVerdict.PROVEN),
+        (math.log1p(MARGIN), LOOKS, ComparisonVerdict.NO_DIFFERENCE),
+        (0.0, naive, ComparisonVerdict.PROVEN),
     )
     for world in WORLDS:
         shares = (share_at_any_look(world, *cell, simulations) for cell in cells)
@@ -259,7 +263,11 @@ def extend(simulations: int) -> None:
 
 
 def share_at_any_look(
-    world: str, shift: float, levels: Mapping[int, float], verdict: Verdict, simulations: int
+    world: str,
+    shift: float,
+    levels: Mapping[int, float],
+    verdict: ComparisonVerdict,
+    simulations: int,
 ) -> float:
     """How often a world gets a verdict at one of the looks at least."""
     rng = np.random.default_rng(simulations)
@@ -274,7 +282,7 @@ def share_at_any_look(
 
 def verdicts_of_many(
     values: Array, lost: Array, lost_baseline: Array, level: float
-) -> dict[Verdict, Array]:
+) -> dict[ComparisonVerdict, Array]:
     """Which of many studies are *proven*, and say *no difference that matters*: the rules of `verdict_of`.
 
     Args:
@@ -305,8 +313,8 @@ def verdicts_of_many(
     edge = math.log1p(MARGIN)
     is_within = (np.maximum(-low_90, high_90) < edge) & (np.abs(losses - losses_baseline) <= 1)
     return {
-        Verdict.PROVEN: is_smaller & (losses <= losses_baseline),
-        Verdict.NO_DIFFERENCE: is_claim & ~is_smaller & (low <= 0.0) & is_within,
+        ComparisonVerdict.PROVEN: is_smaller & (losses <= losses_baseline),
+        ComparisonVerdict.NO_DIFFERENCE: is_claim & ~is_smaller & (low <= 0.0) & is_within,
     }
 
 

@@ -150,7 +150,8 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
     code, _, err = cli(*command)
     assert code == 1
-    assert "170 MB" in err
+    assert "0.25 MB" in err
+    assert "Apache-2.0" in err
     assert not fetched.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
     assert cli(*command)[0] == 0
@@ -468,6 +469,21 @@ def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.Mon
     with pytest.raises(KeyError), compiled_ahead():
         raise KeyError
     assert time.monotonic() - began < 300
+
+
+def test_why_kernels_were_not_compiled_ahead_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failing = [sys.executable, "-S", "-c", "raise OSError('no space left')"]
+    monkeypatch.setattr(
+        demo.subprocess,
+        "Popen",
+        lambda *_, popen=subprocess.Popen, **options: popen(failing, **options),
+    )
+    with compiled_ahead():
+        pass
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "OSError: no space left" in line
 
 
 def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):

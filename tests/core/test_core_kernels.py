@@ -532,14 +532,14 @@ import json, os, sys
 import numpy as np
 from dynslam_bench.core.folders import kernels_folder
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.slam.pose_optimisation import optimise_pose
+from dynslam_bench.slam.pose_optimisation import Measurements, optimise_pose
 
 rng = np.random.default_rng(0)
 points = rng.uniform((-1, -1, 2), (1, 1, 5), (40, 3))
 uv = 500 * points[:, :2] / points[:, 2:] + 320 + rng.normal(0, 1, (40, 2))
 ones, none = np.ones(40), np.zeros(40)
 camera = Camera(width=640, height=640, fx=500.0, fy=500.0, cx=320.0, cy=320.0)
-estimate = optimise_pose(np.eye(4), points, uv, none, ones, none, camera)
+estimate = optimise_pose(np.eye(4), points, Measurements(uv, none, ones, none), camera)
 files = sorted(name for name in os.listdir(kernels_folder()) if name.startswith("slam.pose_optimisation._optimise-"))
 print(json.dumps([estimate.T_cam_world[0, 3], files]))
 """

@@ -12,8 +12,8 @@ from dynslam_bench.evaluation.verdicts import (
     FEWEST,
     LOOKS,
     USUAL_SPREAD,
+    ComparisonVerdict,
     PairedRatio,
-    Verdict,
     detectable,
     family_test,
     findings,
@@ -67,18 +67,18 @@ def test_five_scenes_have_no_interval_at_95_per_cent() -> None:
 @pytest.mark.parametrize(
     ("ratios", "verdict"),
     [
-        ([0.8, 0.82, 0.79, 0.85, 0.81, 0.8], Verdict.PROVEN),
-        ([1.2, 1.25, 1.3, 1.22, 1.4, 1.21], Verdict.WORSE),
-        ([1.0] * 9, Verdict.NO_DIFFERENCE),
-        ([1.0] * 8, Verdict.CANNOT_TELL),
-        ([0.97, 1.03, 1.01, 0.99, 1.02, 0.98, 1.0, 1.01], Verdict.NO_DIFFERENCE),
-        ([0.5, 0.6, 0.9, 0.7, 1.3, 0.8, 0.9], Verdict.PROMISING),
-        ([0.4, 1.9, 0.7, 1.5, 0.9, 1.2], Verdict.CANNOT_TELL),
-        ([0.1] * 5, Verdict.CANNOT_TELL),
-        ([0.1], Verdict.CANNOT_TELL),
+        ([0.8, 0.82, 0.79, 0.85, 0.81, 0.8], ComparisonVerdict.PROVEN),
+        ([1.2, 1.25, 1.3, 1.22, 1.4, 1.21], ComparisonVerdict.WORSE),
+        ([1.0] * 9, ComparisonVerdict.NO_DIFFERENCE),
+        ([1.0] * 8, ComparisonVerdict.CANNOT_TELL),
+        ([0.97, 1.03, 1.01, 0.99, 1.02, 0.98, 1.0, 1.01], ComparisonVerdict.NO_DIFFERENCE),
+        ([0.5, 0.6, 0.9, 0.7, 1.3, 0.8, 0.9], ComparisonVerdict.PROMISING),
+        ([0.4, 1.9, 0.7, 1.5, 0.9, 1.2], ComparisonVerdict.CANNOT_TELL),
+        ([0.1] * 5, ComparisonVerdict.CANNOT_TELL),
+        ([0.1], ComparisonVerdict.CANNOT_TELL),
     ],
 )
-def test_verdicts(ratios: list[float], verdict: Verdict) -> None:
+def test_verdicts(ratios: list[float], verdict: ComparisonVerdict) -> None:
     assert verdict_of(judged(ratios)) is verdict
 
 
@@ -113,17 +113,17 @@ def test_a_setting_that_rarely_acts_and_matters_is_not_excluded() -> None:
     for _ in range(400):
         acts = rng.random(12) >= 0.6
         logs = acts * rng.normal(0.2206, 0.05, 12)
-        wrong += verdict_of(paired_ratio(named(logs.tolist()))) is Verdict.NO_DIFFERENCE
+        wrong += verdict_of(paired_ratio(named(logs.tolist()))) is ComparisonVerdict.NO_DIFFERENCE
     assert wrong / 400 <= 0.05
 
 
 def test_equal_errors_are_said_with_the_scenes_that_settle_them() -> None:
     same = judged([1.0] * 7)
-    assert verdict_of(same) is Verdict.CANNOT_TELL
+    assert verdict_of(same) is ComparisonVerdict.CANNOT_TELL
     assert "exactly the same error in 7 scenes" in " ".join(findings(same))
     needed = scenes_to_settle(same)
     assert needed == 9
-    assert verdict_of(judged([1.0] * needed)) is Verdict.NO_DIFFERENCE
+    assert verdict_of(judged([1.0] * needed)) is ComparisonVerdict.NO_DIFFERENCE
 
 
 def test_no_verdict_says_that_nothing_matters_where_nothing_is_known() -> None:
@@ -131,16 +131,16 @@ def test_no_verdict_says_that_nothing_matters_where_nothing_is_known() -> None:
     wide = PairedRatio(
         ratio=0.60, low=0.30, high=1.10, low_90=0.35, high_90=0.98, high_80=0.9, scenes=8
     )
-    assert verdict_of(wide) is Verdict.PROMISING
+    assert verdict_of(wide) is ComparisonVerdict.PROMISING
     wider = wide.model_copy(
         update={"ratio": 1.479, "low": 0.446, "high": 4.9, "high_90": 4.0, "high_80": 3.0}
     )
-    assert verdict_of(wider) is Verdict.CANNOT_TELL
+    assert verdict_of(wider) is ComparisonVerdict.CANNOT_TELL
 
 
 def test_a_catastrophe_is_said_and_takes_the_proof_away() -> None:
     one_of_fourteen = judged([0.85 + 0.001 * number for number in range(13)] + [20.0])
-    assert verdict_of(one_of_fourteen) is Verdict.BUT_LOST
+    assert verdict_of(one_of_fourteen) is ComparisonVerdict.BUT_LOST
     sentence = ". ".join(findings(one_of_fourteen))
     assert "lost in 1 of 14 scenes" in sentence
     assert "x 20" in sentence
@@ -151,7 +151,7 @@ def test_losses_on_both_sides_leave_the_proof_and_are_said() -> None:
     names = [f"scene {number}" for number in range(14)]
     logs = {name: math.log(0.8) + 0.001 * len(name) for name in names}
     comparison = paired_ratio(logs, ["scene 3"], ["scene 4", "scene 5"])
-    assert verdict_of(comparison) is Verdict.PROVEN
+    assert verdict_of(comparison) is ComparisonVerdict.PROVEN
     assert "scene 3" in " ".join(findings(comparison))
     assert comparison.scenes == 11
     assert comparison.all_scenes == 14
@@ -160,10 +160,10 @@ def test_losses_on_both_sides_leave_the_proof_and_are_said() -> None:
 def test_many_losses_are_worse_whatever_the_typical_error_is() -> None:
     lost = tuple(str(number) for number in range(7))
     comparison = judged([0.5] * 20, lost)
-    assert verdict_of(comparison) is Verdict.WORSE
+    assert verdict_of(comparison) is ComparisonVerdict.WORSE
     only_five = judged([0.5] * 20, lost[:5])
     assert stats.binomtest(5, 5, alternative="greater").pvalue > 0.025
-    assert verdict_of(only_five) is Verdict.BUT_LOST
+    assert verdict_of(only_five) is ComparisonVerdict.BUT_LOST
 
 
 @pytest.mark.parametrize(("lost", "lost_other"), [(0, 0), (1, 0), (5, 0), (6, 0), (9, 2), (3, 3)])
@@ -188,9 +188,9 @@ def test_all_lost_a_lost_baseline_and_no_scenes_cannot_tell() -> None:
         judged([0.9] * 8, (), every[:5]),
         judged([]),
     ):
-        assert verdict_of(comparison) is Verdict.CANNOT_TELL
+        assert verdict_of(comparison) is ComparisonVerdict.CANNOT_TELL
         assert findings(comparison)
-    assert verdict_of(judged([0.9] * 8, every)) is Verdict.WORSE
+    assert verdict_of(judged([0.9] * 8, every)) is ComparisonVerdict.WORSE
 
 
 @pytest.mark.slow
@@ -218,7 +218,7 @@ def test_rules_are_those_of_the_prototype() -> None:
         # the prototype divides by all scenes, those that both lost among them, as we do
         assert comparison.loss_share == pytest.approx(facts["share at most"])
         said.add(verdict)
-    assert len(said) == len(Verdict)
+    assert len(said) == len(ComparisonVerdict)
     families = ["a"] * 5 + ["b"] * 5 + ["c"] * 4 + ["d"] * 4
     logs = rng.normal(-0.1, 0.3, (5, len(families)))
     logs[1, 3] = math.nan
@@ -234,10 +234,10 @@ def test_runs_that_are_lost_in_no_whole_scene_are_said_and_take_the_proof_away()
     logs = named([math.log(0.73 + 0.001 * number) for number in range(28)])
     kept = paired_ratio(logs, runs=84)
     losing = paired_ratio(logs, runs=84, lost_runs=(28, 0))
-    assert verdict_of(kept) is Verdict.PROVEN
-    assert verdict_of(losing) is Verdict.BUT_LOST
+    assert verdict_of(kept) is ComparisonVerdict.PROVEN
+    assert verdict_of(losing) is ComparisonVerdict.BUT_LOST
     assert "lost in 28 of 84 runs" in findings(losing)[0]
-    assert verdict_of(paired_ratio(logs, runs=84, lost_runs=(2, 2))) is Verdict.PROVEN
+    assert verdict_of(paired_ratio(logs, runs=84, lost_runs=(2, 2))) is ComparisonVerdict.PROVEN
 
 
 def test_all_looks_together_exclude_at_the_level_of_one() -> None:
@@ -248,7 +248,7 @@ def test_all_looks_together_exclude_at_the_level_of_one() -> None:
         logs = rng.normal(math.log(1.1), 0.15, 48)
         wrong += any(
             verdict_of(paired_ratio(named(logs[:scenes].tolist()), one_sided=level))
-            is Verdict.NO_DIFFERENCE
+            is ComparisonVerdict.NO_DIFFERENCE
             for scenes, level in LOOKS.items()
         )
     assert wrong / 400 <= 0.08

@@ -24,10 +24,10 @@ from dynslam_bench.runs import (
     RunRecord,
     RunSpec,
     RunStore,
+    make_run_row,
     resolve,
     run_many,
     run_one,
-    run_row,
     score,
 )
 from dynslam_bench.runs.artifacts import keep_map
@@ -443,7 +443,8 @@ def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("oracle", r"has no exact masks"),
         (
             "auto",
-            r"^(?!.*segmentation\.source=none)no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH.*masks=none",
+            r"^(?!.*segmentation\.source=none)no masks for .*0\.25 MB, Apache-2\.0.*170 MB, BSD-3-Clause"
+            r".*onnx:PATH.*masks=none",
         ),
         ("plugin:mine", r"unknown segmenter 'mine'"),
     ],
@@ -626,7 +627,7 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     )
     assert f"--map {file}" in run_command(row)
     assert "backend.map.localisation_only=true" in run_command(row)
-    assert name in run_row(found, None)["settings"]
+    assert name in make_run_row(found, None)["settings"]
     assert name in runs_frame([(found, None)])["settings"][0]
 
 

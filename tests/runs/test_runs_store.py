@@ -30,10 +30,10 @@ from dynslam_bench.runs import (
     RunStore,
     list_runs,
     load_frames,
+    make_run_row,
     open_store,
     rescore,
     resolve,
-    run_row,
     score,
 )
 from dynslam_bench.runs import listing as listing_module
@@ -225,7 +225,7 @@ def test_rows_are_those_of_the_records_and_are_read_once(filled, reads: list[str
     assert unreadable == []
     for row in rows:
         record = store.read(row["run_id"])
-        assert row == run_row(record, store.score(record))
+        assert row == make_run_row(record, store.score(record))
         assert tuple(row) == FIELDS
     reads.clear()
     assert list_runs(store) == (rows, [])

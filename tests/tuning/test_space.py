@@ -12,7 +12,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from dynslam_bench.core import DynslamError, StudyError
 from dynslam_bench.core.records import validated
-from dynslam_bench.tuning import Plan, StudySpec, read_study
+from dynslam_bench.tuning import StudyPlan, StudySpec, read_study
 from dynslam_bench.tuning.study_file import SpaceSpec
 
 WITHOUT_MASKS = "emfoa-oft?masks=none"
@@ -23,12 +23,12 @@ SPLITS = {
 }
 
 
-def plan(tmp_path: Path, space: Any, tracker: str = WITHOUT_MASKS) -> Plan:
+def plan(tmp_path: Path, space: Any, tracker: str = WITHOUT_MASKS) -> StudyPlan:
     values = make_spec(tracker=tracker, **SPLITS).model_dump() | {"space": space}
-    return Plan(validated(StudySpec, values, "the study", StudyError), tmp_path)
+    return StudyPlan(validated(StudySpec, values, "the study", StudyError), tmp_path)
 
 
-def proposals(plan: Plan, count: int = 40) -> list[dict[str, Any]]:
+def proposals(plan: StudyPlan, count: int = 40) -> list[dict[str, Any]]:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     found = []
@@ -49,7 +49,7 @@ def test_a_file_gives_ranges_steps_and_choices_of_its_own(tmp_path: Path) -> Non
         'space.range."backend.tracking.map_radius_px" = { low = 2.0, high = 6.0, step = 0.5 }\n'
         'space.choices."flow.search" = ["emfoa+propagation", "patchmatch"]\n'
     )
-    study = Plan(read_study(file), tmp_path)
+    study = StudyPlan(read_study(file), tmp_path)
     assert study.search.distributions() == {
         # the scale is the setting's own where the file says none
         "features.n_features": IntDistribution(200, 1500, log=True),

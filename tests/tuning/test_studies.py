@@ -47,12 +47,12 @@ from dynslam_bench.runs import RunEvent, RunSpec, RunStore
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
+    ComparisonVerdict,
     Outcome,
     ProblemInstance,
     SpaceSpec,
     Study,
     StudySpec,
-    Verdict,
     database,
     distributions,
     finish,
@@ -100,7 +100,7 @@ def test_a_study_finds_the_known_optimum(folders: list[str], tmp_path: Path) -> 
     assert tuner.study.best_value < -0.5
     assert held.ratio < 1
     assert held.scenes == 1
-    assert summary.verdict == Verdict.CANNOT_TELL, "one sequence held out proves nothing"
+    assert summary.verdict == ComparisonVerdict.CANNOT_TELL, "one sequence held out proves nothing"
     assert not summary.importances, "fourteen trials are too few"
     page = write_page(tuner, summary).read_text()
     assert "Use them" not in page
@@ -157,7 +157,7 @@ def test_constraints_decide_who_is_a_candidate(folders: list[str], tmp_path: Pat
     tuner = run_study(make(folders, tune=folders[:1], trials=3, min_fps=1e9), results=tmp_path)
     assert all(trial.constraints["fps"] > 0 for trial in tuner.study.get_trials())
     summary = finish(tuner)
-    assert summary.verdict is Verdict.CANNOT_TELL
+    assert summary.verdict is ComparisonVerdict.CANNOT_TELL
     assert not any(candidate.feasible for candidate in summary.candidates)
     assert "violates a constraint" in summary.conclusion
 
@@ -792,8 +792,8 @@ def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
     lucky = sum(tuner.run().study.best_value < math.log(0.95) for tuner in tuners)
     summaries = [finish(tuner) for tuner in tuners]
     verdicts = [summary.verdict for summary in summaries]
-    assert verdicts.count(Verdict.PROVEN) == 0
-    assert verdicts.count(Verdict.WORSE) <= 2
+    assert verdicts.count(ComparisonVerdict.PROVEN) == 0
+    assert verdicts.count(ComparisonVerdict.WORSE) <= 2
     assert lucky >= 5, "what the trials alone say"
 
 

@@ -21,7 +21,12 @@ from optuna.trial import TrialState
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import StudyError, read_settings
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.evaluation.verdicts import PairedRatio, Verdict, paired_ratio, verdict_of
+from dynslam_bench.evaluation.verdicts import (
+    ComparisonVerdict,
+    PairedRatio,
+    paired_ratio,
+    verdict_of,
+)
 from dynslam_bench.tuning import (
     Outcome,
     ProblemInstance,
@@ -104,7 +109,7 @@ def test_starts_of_one_scene_are_one_value_and_claim_nothing() -> None:
     assert one.scenes == 1
     assert one.runs == 8
     assert one.low is None
-    assert verdict_of(one) is Verdict.CANNOT_TELL
+    assert verdict_of(one) is ComparisonVerdict.CANNOT_TELL
     assert PairedRatio.model_validate_json(one.model_dump_json()) == one
 
 
@@ -126,34 +131,46 @@ CLOSE_ACCURACY = {"accuracy": NOTHING}
 @pytest.mark.parametrize(
     ("changes", "verdict", "said"),
     [
-        ({}, Verdict.PROVEN, "less ATE: ATE x 0.745 [0.700, 0.800] on 6 scenes"),
-        ({"held_out": NOTHING}, Verdict.NO_DIFFERENCE, "Differences above"),
-        ({"held_out": OPEN}, Verdict.CANNOT_TELL, "in a new study would settle it"),
-        ({"held_out": PERHAPS}, Verdict.PROMISING, "perhaps"),
-        ({"held_out": LOSS}, Verdict.WORSE, "more ATE"),
-        ({"held_out": on_scenes(0.7, 0.72)}, Verdict.CANNOT_TELL, "6 are the fewest"),
-        ({"held_out": on_scenes(*[0.7] * 9, lost=[8])}, Verdict.BUT_LOST, "lost in 1 of 9 scenes"),
-        ({"held_out": on_scenes(*[0.7] * 9, lost=range(9))}, Verdict.WORSE, "none of 9 scenes"),
-        ({"feasible": False}, Verdict.CANNOT_TELL, "violates a constraint"),
-        ({"ate_margin": 0.05, "on_held_out": WIDE_ACCURACY}, Verdict.PROMISING, "below 1.05"),
-        ({"ate_margin": 0.05, "on_held_out": CLOSE_ACCURACY}, Verdict.PROVEN, "less"),
+        ({}, ComparisonVerdict.PROVEN, "less ATE: ATE x 0.745 [0.700, 0.800] on 6 scenes"),
+        ({"held_out": NOTHING}, ComparisonVerdict.NO_DIFFERENCE, "Differences above"),
+        ({"held_out": OPEN}, ComparisonVerdict.CANNOT_TELL, "in a new study would settle it"),
+        ({"held_out": PERHAPS}, ComparisonVerdict.PROMISING, "perhaps"),
+        ({"held_out": LOSS}, ComparisonVerdict.WORSE, "more ATE"),
+        ({"held_out": on_scenes(0.7, 0.72)}, ComparisonVerdict.CANNOT_TELL, "6 are the fewest"),
+        (
+            {"held_out": on_scenes(*[0.7] * 9, lost=[8])},
+            ComparisonVerdict.BUT_LOST,
+            "lost in 1 of 9 scenes",
+        ),
+        (
+            {"held_out": on_scenes(*[0.7] * 9, lost=range(9))},
+            ComparisonVerdict.WORSE,
+            "none of 9 scenes",
+        ),
+        ({"feasible": False}, ComparisonVerdict.CANNOT_TELL, "violates a constraint"),
+        (
+            {"ate_margin": 0.05, "on_held_out": WIDE_ACCURACY},
+            ComparisonVerdict.PROMISING,
+            "below 1.05",
+        ),
+        ({"ate_margin": 0.05, "on_held_out": CLOSE_ACCURACY}, ComparisonVerdict.PROVEN, "less"),
         (
             {"ate_margin": 0.05, "on_held_out": {"accuracy": LOSS}},
-            Verdict.CANNOT_TELL,
+            ComparisonVerdict.CANNOT_TELL,
             "below 1.05",
         ),
         (
             {"held_out": PERHAPS, "ate_margin": 0.05, "on_held_out": {"accuracy": LOSS}},
-            Verdict.CANNOT_TELL,
+            ComparisonVerdict.CANNOT_TELL,
             "below 1.05",
         ),
-        ({"held_out": None, "confirm": GAIN}, Verdict.PROVEN, "less"),
-        ({"held_out": None}, Verdict.CANNOT_TELL, "no frames are left"),
-        ({"failed": "it broke"}, Verdict.CANNOT_TELL, "it broke"),
+        ({"held_out": None, "confirm": GAIN}, ComparisonVerdict.PROVEN, "less"),
+        ({"held_out": None}, ComparisonVerdict.CANNOT_TELL, "no frames are left"),
+        ({"failed": "it broke"}, ComparisonVerdict.CANNOT_TELL, "it broke"),
     ],
 )
 def test_the_conclusion_says_the_verdict_with_its_numbers(
-    changes: dict[str, object], verdict: Verdict, said: str
+    changes: dict[str, object], verdict: ComparisonVerdict, said: str
 ) -> None:
     given, text = conclude(SPEC, [candidate(**changes)], [{str(n): 0.1 * n for n in range(6)}])
     assert given is verdict
@@ -170,7 +187,7 @@ def test_the_worst_scenes_rank_trials_and_all_scenes_judge_them() -> None:
     compared = compare(outcomes(errors[0]), outcomes(errors[1]), objective=OBJECTIVES["worst"])
     assert compared.scenes == 28
     assert compared.what == "ATE"
-    assert verdict_of(compared) is not Verdict.WORSE
+    assert verdict_of(compared) is not ComparisonVerdict.WORSE
 
 
 def test_frames_lost_are_a_value_of_the_coverage_objective() -> None:
@@ -179,11 +196,11 @@ def test_frames_lost_are_a_value_of_the_coverage_objective() -> None:
     lost = {at: replace(run, coverage=0.2, lost=True) for at, run in tracked.items()}
     compared = compare(tracked, lost, objective=OBJECTIVES["coverage"])
     assert compared.scenes == 8
-    assert verdict_of(compared) is Verdict.PROVEN
+    assert verdict_of(compared) is ComparisonVerdict.PROVEN
 
 
 def test_no_trial_and_failed_trials_cannot_tell() -> None:
-    assert judge(None)[0] is Verdict.CANNOT_TELL
+    assert judge(None)[0] is ComparisonVerdict.CANNOT_TELL
     _, text = conclude(SPEC, [], failures=["crashed: no memory", "crashed"])
     assert "2 trials failed, the first one as crashed: no memory" in text
     # so where a program refuses a part of the range, and other trials did better
@@ -193,7 +210,7 @@ def test_no_trial_and_failed_trials_cannot_tell() -> None:
 
 def test_settings_without_any_effect_are_named() -> None:
     verdict, text = conclude(SPEC, [candidate()], inert=3)
-    assert verdict is Verdict.NO_DIFFERENCE
+    assert verdict is ComparisonVerdict.NO_DIFFERENCE
     assert "All 3 trials with other settings have the baseline's trajectories" in text
 
 
@@ -394,7 +411,7 @@ def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
         tuner.run()
     summary = finish(tuner)
     chosen = summary.candidates[0]
-    assert summary.verdict == Verdict.PROVEN
+    assert summary.verdict == ComparisonVerdict.PROVEN
     assert chosen.params == {"wobble": 0}
     assert chosen.held_out.ratio == pytest.approx(0.5)
     assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
@@ -406,8 +423,12 @@ def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None
     tuner.price = 0.6
     summary = finish(tuner.run())
     assert not summary.is_to_use
-    assert summary.verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL, Verdict.WORSE)
-    offered = summary.verdict is Verdict.PROMISING
+    assert summary.verdict in (
+        ComparisonVerdict.PROMISING,
+        ComparisonVerdict.CANNOT_TELL,
+        ComparisonVerdict.WORSE,
+    )
+    offered = summary.verdict is ComparisonVerdict.PROMISING
     expected = summary.candidates[0].params if offered else {}
     assert read_settings(tuner.folder / "best.toml") == expected, "written with its status"
     assert f'status = "{summary.verdict.value}"' in (tuner.folder / "best.toml").read_text()
@@ -562,18 +583,18 @@ def test_a_finished_study_keeps_the_errors_of_each_judging_scene(tmp_path: Path)
 @pytest.mark.parametrize(
     ("verdict", "evidence", "extendable", "wanted"),
     [
-        (Verdict.PROVEN, on_scenes(*[0.5] * 12), False, "--settings best.toml"),
-        (Verdict.WORSE, on_scenes(*[2.0] * 12), False, "run toy SEQUENCE"),
-        (Verdict.NO_DIFFERENCE, on_scenes(*[1.0] * 12), False, "run toy SEQUENCE"),
-        (Verdict.PROMISING, UNSETTLED, True, "--scenes 12"),
+        (ComparisonVerdict.PROVEN, on_scenes(*[0.5] * 12), False, "--settings best.toml"),
+        (ComparisonVerdict.WORSE, on_scenes(*[2.0] * 12), False, "run toy SEQUENCE"),
+        (ComparisonVerdict.NO_DIFFERENCE, on_scenes(*[1.0] * 12), False, "run toy SEQUENCE"),
+        (ComparisonVerdict.PROMISING, UNSETTLED, True, "--scenes 12"),
         (
-            Verdict.CANNOT_TELL,
+            ComparisonVerdict.CANNOT_TELL,
             on_scenes(0.8, 0.9, 0.7, 1.2, 0.9, 1.1, 0.8, 0.95),
             False,
             "tune run",
         ),
         (
-            Verdict.BUT_LOST,
+            ComparisonVerdict.BUT_LOST,
             on_scenes(*[0.5] * 12, lost=[3]),
             False,
             "'scene 3' --settings best.toml --snapshots",
@@ -581,7 +602,7 @@ def test_a_finished_study_keeps_the_errors_of_each_judging_scene(tmp_path: Path)
     ],
 )
 def test_every_verdict_has_a_command_to_go_on_with(
-    verdict: Verdict, evidence: PairedRatio, extendable: bool, wanted: str
+    verdict: ComparisonVerdict, evidence: PairedRatio, extendable: bool, wanted: str
 ) -> None:
     spec = make_spec(extendable=extendable)
     summary = StudySummary(

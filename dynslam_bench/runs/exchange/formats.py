@@ -19,8 +19,8 @@ from dynslam_bench.geometry import (
     Array,
     Camera,
     FileNotes,
+    LoadedTrajectory,
     Trajectory,
-    TumFile,
     is_number,
     load_trajectory,
     se3,
@@ -33,7 +33,7 @@ from dynslam_bench.slam.map_files import Cloud
 
 def read_trajectory(
     path: str | Path, timestamps: str | Path | None = None, topic: str | None = None
-) -> TumFile:
+) -> LoadedTrajectory:
     """Read a trajectory, with counts of the lines that were skipped, sorted or repaired (`FileNotes`).
 
     Args:
@@ -52,7 +52,7 @@ def read_trajectory(
         trajectory = read_colmap(
             path, None if timestamps is None else _stamps_by_name(Path(timestamps))
         )
-        return TumFile(trajectory, FileNotes(lines=len(trajectory)))
+        return LoadedTrajectory(trajectory, FileNotes(lines=len(trajectory)))
     if is_bag(path):
         return read_bag_trajectory(path, topic)
     if path.is_dir():
@@ -241,7 +241,7 @@ PATH_MESSAGE = "nav_msgs/msg/Path"
 """Type of the message that holds a whole trajectory."""
 
 
-def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
+def read_bag_trajectory(path: Path, topic: str | None = None) -> LoadedTrajectory:
     """The poses of a ROS 1 or 2 bag or an MCAP file, which are assumed to be the camera's own.
 
     Args:

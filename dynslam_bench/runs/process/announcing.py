@@ -1,4 +1,4 @@
-"""What code in this process is about to do, announced before it is done.
+"""Announcements of what code in this process is about to do, made before it is done.
 
 Python announces openings, listings, imports and programs to audit hooks (`sys.audit`). What is
 looked up in ``os.environ`` is announced by a subclass of its class, in the same way. So are files

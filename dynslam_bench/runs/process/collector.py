@@ -1,4 +1,4 @@
-"""What a run read, made of what a recorder has noted: contents of files, modules, distributions and programs."""
+"""The collection of what a run read from a recorder's notes: files, modules, distributions and programs."""
 
 import os
 import re
@@ -40,7 +40,7 @@ from dynslam_bench.core.reads import (
 from dynslam_bench.runs.process.origins import Origins
 
 _LOADED_NS = time.time_ns()
-"""What the fork server has loaded is older than this: it imports this module, too."""
+"""Time when this module was loaded: modules that the fork server has loaded are older."""
 _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
@@ -88,7 +88,7 @@ _OWN_DISTRIBUTION = "dynslam-bench"
 
 
 class Stamp(NamedTuple):
-    """What tells that a file is the same as before: its place on the disk, its size and its times.
+    """State of a file that tells whether it is the same as before: its place on the disk, its size and its times.
 
     Attributes:
         device: The device.
@@ -298,7 +298,7 @@ class Collector:
         return ABSENT if note.stamp is None and content != UNREADABLE else content
 
     def _still_missing(self) -> set[str]:
-        """What was looked for and is not there at the end either: the rest was made by the run."""
+        """Paths that were looked for and are still missing at the end: the run made the others."""
         return {
             path
             for path in set(self.notes.missing)
@@ -517,9 +517,11 @@ class Collector:
         names: set[str] = set()
         set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
         for file in files:
+            # only code of others counts
             stamp = stamp_of(file)
             if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
                 continue
+            # in a source every word that may name a variable, in a library those that are set
             if file.endswith(".py"):
                 content = Path(file).read_bytes()
                 if any(mark in content for mark in marks):
@@ -527,6 +529,7 @@ class Collector:
             elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
                 content = Path(file).read_bytes()
                 names |= {name for name in set_now if os.fsencode(name) in content}
+        # variables that the run itself has set are no input
         names -= {name.removeprefix("$") for name in self.notes.made}
         return {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
 
@@ -573,12 +576,14 @@ class Collector:
         opened_names = set(map(os.path.basename, texts))
         for text in texts:
             for word in self._words(text):
+                # where the file may be, by the folders of the text and of the run
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
                 if not there and word not in opened_names:
                     there = self._files_below(os.path.dirname(text), word)
                     there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
+                # a name in a source may be looked for without being there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
         missing = {path for path in missing if not self.is_output(path)}
@@ -619,7 +624,7 @@ class Collector:
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:
-        """Where a file of that name could lie."""
+        """Places where a file of that name could lie."""
         folders = {os.path.dirname(text), str(self._base_folders.work)}
         if self._base_folders.plugin is not None:
             folders.add(str(self._base_folders.plugin))

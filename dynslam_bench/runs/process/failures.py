@@ -34,7 +34,7 @@ _RUNNER_FILES = (__file__, str(Path(__file__).with_name("child.py")))
 
 
 class FailedAt(Exception):
-    """Where a run was when its cause was raised."""
+    """Frame at which a run was when its cause was raised."""
 
 
 @contextmanager
@@ -123,7 +123,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _broken_infrastructure(error: BaseException | None) -> str:
-    """What of the infrastructure broke, by an exception or one of its causes; empty if nothing did."""
+    """Name the infrastructure that broke, by an exception or one of its causes; empty if nothing did."""
     while error is not None:
         is_of_disk = isinstance(error, OSError) and error.errno in _DISK_ERRORS
         if is_of_disk or isinstance(error, InfrastructureError):

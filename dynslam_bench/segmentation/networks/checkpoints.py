@@ -25,7 +25,7 @@ class Checkpoint:
     file: str
     url: str
     sha256_prefix: str
-    megabytes: int
+    megabytes: float
     license: str
     trained_on: str
 
@@ -40,6 +40,18 @@ COCO = Checkpoint(
     trained_on="COCO train2017",
 )
 """Torchvision's Mask R-CNN, ResNet-50 FPN."""
+SELFIE = Checkpoint(
+    id="selfie",
+    file="selfie_segmentation-8d13b7fa.tflite",
+    url="https://cdn.jsdelivr.net/npm/@mediapipe/selfie_segmentation@0.1.1675465747/selfie_segmentation.tflite",
+    sha256_prefix="8d13b7fae74af625c641226813616a2117bd6bca19eb3b75574621fc08557f27",
+    megabytes=0.25,
+    license="Apache-2.0",
+    trained_on="Google's pictures of people",
+)
+"""MediaPipe's selfie segmentation, the file of its npm package: one probability map of people, for indoor scenes."""
+CHECKPOINTS = {checkpoint.id: checkpoint for checkpoint in (COCO, SELFIE)}
+"""Published checkpoints by id, which is the source of masks that uses them."""
 
 
 def embedded_weights() -> Path:

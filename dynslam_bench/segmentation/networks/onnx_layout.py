@@ -1,4 +1,4 @@
-"""Which layout the outputs of an ONNX network have: first by the file's metadata, then by exact shapes.
+"""Layouts of the outputs of ONNX networks, detected by the file's metadata first, then by exact shapes.
 
 Sizes of different layouts may coincide: detections of a network with two classes have as many
 channels before non-maximum suppression (a score a class) as after it (the best score and its
@@ -177,7 +177,7 @@ def detect_layout(
     where: str,
     asked: str = "auto",
 ) -> Layout:
-    """Which layout these outputs have.
+    """Detect the layout of a network's outputs.
 
     Args:
         outputs: Names, shapes and types.
@@ -312,7 +312,7 @@ def _detections(
     *,
     channels_last: bool,
 ) -> Iterator[_Fit]:
-    """What detections of shape ``[1, first, second]`` may be, for so many mask coefficients."""
+    """Layouts that fit detections of shape ``[1, first, second]`` with so many mask coefficients."""
     last = f"M = {coefficients}" + (" and prototypes [1, h, w, M]" if channels_last else "")
     for channels_first, channels, rows in ((True, first, second), (False, second, first)):
         # a score a class, with or without objectness before them
@@ -501,7 +501,7 @@ def _not_understood(
 
 
 def _said(facts: Metadata) -> str:
-    """What the metadata say, for a message; empty if nothing."""
+    """Summarise the metadata for a message; empty if they say nothing."""
     parts = []
     if facts.suppressed is not None:
         inside = "that suppression is inside (end2end, nms)"
@@ -515,7 +515,7 @@ def _said(facts: Metadata) -> str:
 
 
 def assumed_names(layout: Layout, metadata: Mapping[str, str]) -> str:
-    """What is assumed of the classes where the file does not name its one or two; empty where nothing is."""
+    """Describe the names assumed where the file does not name its one or two classes; empty where it does."""
     if "names" in metadata or len(layout.names) > 2:
         return ""
     taken = [f"class {number} is taken for {name}" for number, name in layout.names.items()]

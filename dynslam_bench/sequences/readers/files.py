@@ -1,4 +1,4 @@
-"""What readers are made of: lists of images and counts of what was not used, YAML, CSV, poses of a body."""
+"""Parts of readers: lists of images and counts of what was not used, YAML, CSV, poses of a body."""
 
 import math
 import os
@@ -29,8 +29,8 @@ from dynslam_bench.geometry import (
     Array,
     Camera,
     FileNotes,
+    LoadedTrajectory,
     Trajectory,
-    TumFile,
     format_ns,
     load_tum,
     ns_of,
@@ -504,7 +504,7 @@ def size_of_first(folder: Path, images: ImageList) -> tuple[int, int]:
 MOST_BYTES = 1 << 16
 """A calibration has a few kilobytes."""
 MOST_BRACKETS = 1000
-"""What opens more takes yaml's parser minutes."""
+"""Most brackets of a file that is parsed: yaml's parser takes minutes for more."""
 
 
 def read_yaml(path: Path) -> Mapping[str, Any]:
@@ -596,7 +596,7 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
 
 def camera_poses_from_body(
     stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str
-) -> TumFile | None:
+) -> LoadedTrajectory | None:
     """The camera's true poses from those of a body, e.g. an IMU: ``T_world_cam = T_world_body @ T_body_cam``.
 
     Rows without a rotation are left out and counted. Of several with one stamp the last counts.
@@ -632,7 +632,7 @@ POSE = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")
 """Heading of VSLAM-LAB's tables of poses."""
 
 
-def read_pose_table(path: Path, T_body_cam: Array) -> TumFile:
+def read_pose_table(path: Path, T_body_cam: Array) -> LoadedTrajectory:
     """The camera's poses of a table of EuRoC or VSLAM-LAB.
 
     Args:
@@ -647,8 +647,8 @@ def read_pose_table(path: Path, T_body_cam: Array) -> TumFile:
     file = load_tum(path)
     trajectory = file.trajectory.with_poses(file.trajectory.T_world_cam @ T_body_cam)
     if file.every_line is None:
-        return TumFile(trajectory, file.notes)
-    return TumFile(
+        return LoadedTrajectory(trajectory, file.notes)
+    return LoadedTrajectory(
         trajectory, file.notes, file.every_line.with_poses(file.every_line.T_world_cam @ T_body_cam)
     )
 

@@ -17,8 +17,8 @@ from dynslam_bench.core import SequenceError, TrajectoryError, read_text, transl
 from dynslam_bench.geometry import (
     Array,
     Camera,
+    LoadedTrajectory,
     Trajectory,
-    TumFile,
     from_seconds,
     load_tum,
     nearest_gap,
@@ -135,7 +135,7 @@ def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
     return file.trajectory, _not_taken(file)
 
 
-def _not_taken(file: TumFile) -> str:
+def _not_taken(file: LoadedTrajectory) -> str:
     """One phrase on the lines of a ground truth that were not taken as they stand; empty for none."""
     return ", ".join(f"ground truth: {phrase}" for phrase in file.notes.describe())
 

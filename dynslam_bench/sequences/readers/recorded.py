@@ -214,7 +214,7 @@ class RecordedSequence:
         return [people.files[i] for i in at]
 
     def _count_poses(self) -> dict[str, int]:
-        """How many poses the ground truth has, and how many frames have none."""
+        """Number of poses of the ground truth, and of frames that have none."""
         stamps = self.timestamps
         truth = self.ground_truth
         if truth is None:

@@ -17,7 +17,8 @@ from dynslam_bench.sequences.synthetic.families import (
 )
 from dynslam_bench.sequences.synthetic.moving_objects import OBJECTS
 from dynslam_bench.sequences.synthetic.scene import Variant
-from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
+from dynslam_bench.sequences.synthetic.sealed import SCENE_BYTES, scene_of_text
+from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, MAX_FRAMES, TUNE_SCENES
 
 VARIANTS: dict[str, Variant] = {
     **REPLICAS,
@@ -37,12 +38,15 @@ SYNTHETIC_IDS = tuple(f"synthetic/{name}" for name in VARIANTS)
 """Every rendered sequence that is listed, scene 0, default length."""
 
 _OPTIONS = {
-    "scene": (0, HELD_OUT_SCENES.stop - 1),
+    "scene": (0, 2 ** (8 * SCENE_BYTES) - 1),
     "frames": (1, MAX_FRAMES),
     "noise": (0, 999_999_999),
 }
-"""What may stand behind the question mark, with the least and the largest value."""
+"""Options behind the question mark of an id, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
+
+PROBE_FRAMES = 2
+"""Frames of a public scene that tell machines apart: the second has motion blur of what moves."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class SyntheticId:
 
     Attributes:
         name: For example ``walking_xyz``.
-        scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held
-            out.
+        scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, all others
+            held out. It has 64 bits.
         frames: Length of the sequence; frames are the same whatever the length.
         noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own
             draw.
@@ -71,7 +75,7 @@ class SyntheticId:
     @property
     def split(self) -> Literal["tune", "held-out"]:
         """Split that the scene belongs to."""
-        return "held-out" if self.scene in HELD_OUT_SCENES else "tune"
+        return "tune" if self.scene in TUNE_SCENES else "held-out"
 
     @property
     def whole(self) -> str:
@@ -86,9 +90,12 @@ class SyntheticId:
 def parse_synthetic_id(text: str) -> SyntheticId:
     """Parse an id such as ``synthetic/walking_xyz?scene=101&frames=150``; ``walking_xyz@101`` is read as scene 101.
 
+    A sealed scene, ``scene=sealed:ROUND/INDEX``, is read as the number that the salt in the
+    environment gives it, see `sealed.sealed_scene`.
+
     Raises:
         SequenceError: Unknown name (with a did-you-mean), or a scene, length or noise seed out of
-            range.
+            range, or a sealed scene without its salt.
     """
     match = _ID.fullmatch(text)
     if match is None:
@@ -112,10 +119,19 @@ def parse_synthetic_id(text: str) -> SyntheticId:
             raise SequenceError(f"'{text}' has an unknown option '{option}'", forms)
         if key in options:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")
+        sealed = scene_of_text(value, name) if key == "scene" else None
+        if sealed is not None:
+            options[key] = sealed
+            continue
         low, high = _OPTIONS[key]
-        if not re.fullmatch(r"[0-9]{1,9}", value) or not low <= int(value) <= high:
+        if not re.fullmatch(r"[0-9]{1,20}", value) or not low <= int(value) <= high:
             raise SequenceError(
                 f"{key} '{value}' of '{text}' is not a whole number from {low} to {high}"
             )
         options[key] = int(value)
     return replace(SyntheticId(name, frames=VARIANTS[name].frames), **options)  # type: ignore[arg-type]  # all integers
+
+
+def probe_id(family: str) -> str:
+    """The id of the public scene whose bits tell machines apart that render a family."""
+    return f"synthetic/{family}?scene=0&frames={PROBE_FRAMES}"

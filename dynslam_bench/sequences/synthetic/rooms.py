@@ -20,7 +20,7 @@ from dynslam_bench.sequences.synthetic.parts import (
     rotation_about_z,
     wall,
 )
-from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
+from dynslam_bench.sequences.synthetic.settings import TUNE_SCENES
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ Style = dict[str, Any]
 
 def pick(rng: np.random.Generator, scene: int, low: float, high: float, steps: int = 64) -> float:
     """A value of [low, high] from the even points of a grid for tuning scenes, the odd ones for held-out ones."""
-    odd = scene in HELD_OUT_SCENES
+    odd = scene not in TUNE_SCENES
     return low + (high - low) * (2 * int(rng.integers(steps)) + odd) / (2 * steps - 1)
 
 
 def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
     """A member of the split's half of the pool."""
-    half = pool[1::2] if scene in HELD_OUT_SCENES else pool[::2]
+    half = pool[::2] if scene in TUNE_SCENES else pool[1::2]
     return half[int(rng.integers(len(half)))]
 
 
@@ -185,6 +185,7 @@ def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Pr
     """A pile of books at either end."""
     parts: Primitives = []
     for k in range(2):
+        # two to four books, each turned a little on the one below
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
             shade = 0.25 + 0.7 * rng.random(3)

@@ -89,7 +89,7 @@ class FrameStore:
         self.camera = camera
 
     def path(self, kind: str, stamp: float) -> Path:
-        """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
+        """Path of a frame's image of a kind (``rgb``, ``depth``, ``masks``)."""
         return self.folder / kind / f"{stamp:.6f}.png"
 
     def bytes_of(self, kind: str, stamp: float) -> bytes | None:
@@ -172,7 +172,7 @@ class SyntheticSequence:
         id: For example ``synthetic/walking_xyz?scene=0&frames=600``.
         whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all
             lengths cut the same script.
-        split: ``tune`` (scenes 0-99) or ``held-out`` (100-199).
+        split: ``tune`` (scenes 0-99) or ``held-out`` (all others).
         tags: How much of the scene moves.
         noise: Seed of the sensors' noise; None for the scene's own.
         timestamps: Stamps of all frames in seconds.

@@ -22,7 +22,7 @@ MAX_FRAMES = 36_000
 TUNE_SCENES = range(0, 100)
 """Scenes to tune on."""
 HELD_OUT_SCENES = range(100, 200)
-"""Scenes that are kept for the final comparison."""
+"""Scenes that are kept for the final comparison; so are all scenes above them, which no list names."""
 
 
 class DepthSensor(Settings):

@@ -38,7 +38,7 @@ _POLL_S = 0.1
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")
 """Escape sequences that colour a terminal's text."""
 WRITE_THERE = "let the command write to {output}, a new file in its working folder"
-"""What to do where the trajectory is not of this run."""
+"""Advice where the trajectory is not of this run."""
 LONGEST_TAIL = 1 << 16
 """Bytes of a program's output of which the end is kept."""
 
@@ -136,7 +136,7 @@ class BatchTracker:
             )
 
         # read the trajectory, if it is of this run
-        self._check_own(output)
+        self._check_written_now(output)
         try:
             trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
@@ -185,7 +185,7 @@ class BatchTracker:
             self._folder.close()
             self._folder = None
 
-    def _check_own(self, output: Path) -> None:
+    def _check_written_now(self, output: Path) -> None:
         """Refuse a trajectory that the program did not write in this run.
 
         Raises:
@@ -367,7 +367,7 @@ def _last_words(log: str) -> str:
 
 
 def _display_hint(log: str) -> str:
-    """What to do if a log speaks of a display; else an empty text."""
+    """Advice where a log speaks of a display; else an empty text."""
     if re.search("display|x11|glx|opengl", log, re.IGNORECASE):
         return "does it need a display? switch its viewer off, or put xvfb-run before it"
     return ""

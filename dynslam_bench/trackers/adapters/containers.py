@@ -10,7 +10,7 @@ from pathlib import Path
 from dynslam_bench.core import SettingsError
 
 ENGINES = ("docker", "podman", "apptainer")
-"""What runs images, in the order in which they are looked for."""
+"""Programs that run images, in the order in which they are looked for."""
 INSPECT_S = 30.0
 """Seconds that an engine may take to say which image it has."""
 _ENDS_WITH_THE_RUN = (
@@ -58,7 +58,7 @@ class Container:
         return self._chosen() == "apptainer"
 
     def identity(self) -> str:
-        """What tells one image from another: its digest; of a file its name, as its content counts by itself.
+        """Text that tells one image from another: its digest; of a file its name, as its content counts by itself.
 
         The image's name where the engine is not here, or has no such image: nothing runs then.
         """
@@ -123,6 +123,7 @@ class Container:
         variables: Mapping[str, str],
         alive: Path,
     ) -> list[str]:
+        """The command of docker or podman; arguments as of `command`."""
         command = [engine, "run", "--rm", "--interactive", "--network", "none"]
 
         # files belong to this user
@@ -163,6 +164,7 @@ class Container:
         writable: Iterable[Path],
         variables: Mapping[str, str],
     ) -> list[str]:
+        """The command of apptainer; arguments as of `command`."""
         command = ["apptainer", "exec", "--cleanenv", "--no-home"]
         if self.gpu:
             command.append("--nv")

@@ -120,6 +120,7 @@ class ProgramSetting(Record):
         return self
 
     def _check_choices(self) -> None:
+        """Refuse choices beside a range, repeated ones, or a default that is none of them."""
         if self.low is not None or self.high is not None or self.limits is not None:
             raise ValueError("it has choices and a range: leave one out")
         if len(set(map(str, self.choices))) < len(self.choices):
@@ -129,6 +130,7 @@ class ProgramSetting(Record):
             raise ValueError(f"the default {self.default!r} is none of its choices: {shown}")
 
     def _check_range(self, default: float) -> None:
+        """Refuse a range that is no range, or that the default or the limits contradict."""
         if not all(math.isfinite(number) for number in (default, *self._bounds)):
             raise ValueError("its numbers must be finite")
         if (self.low is None) != (self.high is None):
@@ -258,7 +260,7 @@ _CLASSES: dict[tuple[type[Settings], str], type[Settings]] = {}
 
 
 class ProgramFile(Record):
-    """What the TOML file of a program says.
+    """Content of a program's TOML file.
 
     Attributes:
         name: Shown in tables.
@@ -316,7 +318,7 @@ class ProgramFile(Record):
 
 
 class BatchProgram(ProgramFile):
-    """What the TOML file of `batch:FILE` says.
+    """Content of the TOML file of `batch:FILE`.
 
     The command has ``{sequence}`` (a folder in TUM layout), ``{camera}`` (ORB-SLAM's YAML),
     ``{associations}``, ``{output}`` and ``{folder}`` (which holds these), too.
@@ -350,7 +352,7 @@ class BatchProgram(ProgramFile):
 
 
 class ServedProgram(ProgramFile):
-    """What the TOML file of `subprocess:FILE` says: of a program that answers frame by frame.
+    """Content of the TOML file of `subprocess:FILE`, a program that answers frame by frame.
 
     Attributes:
         images: ``raw``: one memory-mapped file; ``png``: two PNG files a frame.
@@ -603,6 +605,7 @@ def _check_placeholders(
     document: ProgramDocument[Any], places: set[str], *, needs_all: bool
 ) -> None:
     """Refuse placeholders that stand for nothing, and settings that reach no program."""
+    # all texts in which placeholders may stand
     program = document.program
     texts = {"command": " ".join(program.command), "environment": " ".join(program.environment)}
     for target, text in document.templates.items():
@@ -620,6 +623,8 @@ def _check_placeholders(
                 f"{close}; {escape}" if close else escape,
             )
         used |= names
+
+    # a setting that no text names would have no effect
     unused = sorted(settings - used)
     if unused and needs_all:
         names_shown = ", ".join(unused)
@@ -782,7 +787,7 @@ def read_served(path: Path) -> ProgramDocument[ServedProgram]:
 
 
 def describe_batch(value: str) -> dict[str, Any]:
-    """What the file of `batch:FILE` says, as fields of its `TrackerSpec`.
+    """Read the file of `batch:FILE` into fields of its `TrackerSpec`.
 
     Raises:
         SettingsError: It is damaged.
@@ -791,7 +796,7 @@ def describe_batch(value: str) -> dict[str, Any]:
 
 
 def describe_served(value: str) -> dict[str, Any]:
-    """What the file of `subprocess:FILE.toml` says, as fields of its `TrackerSpec`; empty for `subprocess:COMMAND`.
+    """Read the file of `subprocess:FILE.toml` into fields of its `TrackerSpec`; none for `subprocess:COMMAND`.
 
     Raises:
         SettingsError: It is damaged.
@@ -808,6 +813,7 @@ def describe_served(value: str) -> dict[str, Any]:
 
 
 def _described(document: ProgramDocument[Any], base: type[Settings]) -> dict[str, Any]:
+    """Fields of a `TrackerSpec` from a program's file; its presets are checked."""
     program = document.program
     try:
         settings = settings_class(base, document.declared)

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackingState, TrackResult
-from dynslam_bench.contracts.checks import faults
+from dynslam_bench.contracts.checks import as_covariance, faults
 from dynslam_bench.core import (
     SHARED_MEMORY,
     DynslamError,
@@ -181,7 +181,7 @@ class Program:
         return code
 
     def ending(self, code: int) -> str:
-        """How it ended, with its last line, in words."""
+        """Words on the program's end, with its last line."""
         shown = "it wrote no message"
         if self._last_line():
             shown = f"its last line: '{self._last_line()}'"
@@ -314,7 +314,14 @@ def read_track_answer(
         stats = _numbers(answer, "stats")
         timings = _numbers(answer, "timings")
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
-    result = TrackResult(pose, cast(TrackingState, str(answer.get("state"))[:80]), stats, timings)
+    covariance = answer.get("motion_covariance")
+    result = TrackResult(
+        pose,
+        cast(TrackingState, str(answer.get("state"))[:80]),
+        stats,
+        timings,
+        motion_covariance=None if covariance is None else as_covariance(covariance),
+    )
     for fault in faults(result, frame):
         raise TrackerError(f"{who}: answered {fault.found}", fault.cause)
     return result
@@ -449,7 +456,7 @@ def _with_space(size: int) -> TemporaryFolder:
 
 
 class Launch(NamedTuple):
-    """How a program is started.
+    """Start of a program.
 
     Attributes:
         command: Program and arguments.
@@ -550,7 +557,7 @@ class ProgramTracker:
             raise
 
     def launch(self, camera: Camera, exchanged: Path) -> Launch:
-        """How the program is started.
+        """Start of the program.
 
         Args:
             camera: The camera of the frames.
@@ -676,7 +683,7 @@ class DescribedProgramTracker(ProgramTracker):
         )
 
     def launch(self, camera: Camera, exchanged: Path) -> Launch:
-        """Its command with the settings' values; the files that it reads are written."""
+        """Command of the program with the settings' values; the files that it reads are written."""
         threads = str(self.context.threads)
         places = {"threads": threads, **camera_values(camera, self.context.fps)}
         filled = self._document.filled(self._settings, places)

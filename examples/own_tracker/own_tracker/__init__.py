@@ -5,7 +5,7 @@ from dynslam_bench.core.settings import Settings, tunable
 
 
 class ShiftSettings(Settings):
-    """What users, studies and agents may change."""
+    """Settings that users, studies and agents may change."""
 
     min_response: float = tunable(
         0.05, low=0.01, high=0.5, scale="log", meaning="peak below which a frame is lost"

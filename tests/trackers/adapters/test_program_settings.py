@@ -30,7 +30,7 @@ from dynslam_bench.trackers.adapters.program_file import (
 )
 from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.tuning import Study, StudySpec
-from dynslam_bench.tuning.plan import Plan
+from dynslam_bench.tuning.plan import StudyPlan
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0, (0.1, -0.2, 0.0, 0.0, 0.3), 5000.0)
@@ -207,7 +207,7 @@ def test_a_study_may_not_search_beyond_the_limits(slam, span, words):
         space={"include": ("features",), "range": {"features": span}},
     )
     with pytest.raises(DynslamError, match=f"features.*{words}"):
-        Plan(spec)
+        StudyPlan(spec)
 
 
 def changed(text, old, new):

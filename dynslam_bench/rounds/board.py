@@ -1,0 +1,181 @@
+"""`report`: the board of a round says that it was sealed, who ran what, and who reproduced it."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+
+from dynslam_bench.core import DynslamError, ReportError, write_atomic
+from dynslam_bench.reports import build_report
+from dynslam_bench.rounds.files import RoundFolder, open_round
+from dynslam_bench.rounds.rows import ScoredRow, agreement, scored
+from dynslam_bench.rounds.verifying import faults_of
+
+BOARD_FILE = "round.md"
+"""The board as Markdown."""
+COLUMNS = ("entry", "median ATE (mm)", "scenes", "not ok", "run by", "reproduced by")
+
+
+@dataclass(frozen=True)
+class BoardRow:
+    """One entry.
+
+    Attributes:
+        entry: Its name.
+        median_ate_m: Median over its scenes of the error, metres; None without one.
+        scenes: Scenes on which it was run.
+        not_ok: Scenes on which it was lost or did not come to its end.
+        run_by: The runner whose rows are shown: the one with most scenes.
+        reproduced: By name of each other runner: how many rows agree, how many of these to the last
+            bit, and how many there are.
+    """
+
+    entry: str
+    median_ate_m: float | None
+    scenes: int
+    not_ok: int
+    run_by: str
+    reproduced: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """The row as `COLUMNS` name it."""
+        error = "" if self.median_ate_m is None else f"{1000 * self.median_ate_m:.2f}"
+        words = [
+            f"{by}: {agree} of {rows}" + (f", {same} identical" if same else "")
+            for by, (agree, same, rows) in self.reproduced.items()
+        ]
+        counts = (str(self.scenes), str(self.not_ok))
+        return self.entry, error, *counts, self.run_by, "; ".join(words) or "nobody"
+
+
+@dataclass(frozen=True)
+class RoundReport:
+    """The board of a round.
+
+    Attributes:
+        remarks: Remarks on the whole board, a line each.
+        rows: The entries, the best first.
+        faults: What is wrong with the results, a line each; rows of such runners are shown all the
+            same.
+        markdown: The board as a file.
+        html: The pages of the reference runner's bank.
+    """
+
+    remarks: list[str]
+    rows: list[BoardRow]
+    faults: list[str]
+    markdown: Path
+    html: Path
+
+
+def report(folder: str | Path, output: str | Path | None = None) -> RoundReport:
+    """Make the board of a round; everything is scored from the published trajectories.
+
+    Args:
+        folder: The round's folder.
+        output: Folder of the report; ``report`` in the round's folder by default.
+
+    Raises:
+        ReportError: Nobody has published results.
+        RunError: The round is not revealed, or its salt is another one.
+    """
+    opened = open_round(folder)
+    _ = opened.reveal
+    runners = opened.runners()
+    if not runners:
+        raise ReportError(
+            f"round {opened.round.name} has no results yet",
+            "run it: dynslam-bench round run FOLDER --by NAME",
+        )
+    target = Path(output or opened.root / "report").expanduser().absolute()
+
+    # all rows of all runners
+    faults: list[str] = []
+    rows: list[ScoredRow] = []
+    for by in runners:
+        faults += faults_of(opened, by, render=False)
+        for row in opened.read_results(by).rows:
+            try:
+                rows.append(scored(opened, by, row))
+            except DynslamError as error:
+                faults.append(f"{by}, {row.entry}: {error}")
+    listed = [row for row in rows if row.row.entry in opened.reveal.entries]
+    board = [
+        _board_row(opened, entry, [row for row in listed if row.row.entry == entry])
+        for entry in opened.reveal.entries
+        if any(row.row.entry == entry for row in listed)
+    ]
+    board.sort(key=lambda row: (row.not_ok, row.median_ate_m or float("inf")))
+
+    # the board, and the pages of the runner with most rows
+    remarks = _remarks(opened, runners)
+    markdown = target / BOARD_FILE
+    write_atomic(markdown, _markdown(opened, remarks, board, faults))
+    reference = max(runners, key=lambda by: sum(row.by == by for row in listed))
+    paths = build_report(
+        [opened.bank(reference)],
+        target,
+        protocol=opened.round.protocol,
+        title=f"Sealed round {opened.round.name}, run by {reference}",
+    )
+    return RoundReport(remarks, board, faults, markdown, paths.html)
+
+
+def _board_row(opened: RoundFolder, entry: str, rows: list[ScoredRow]) -> BoardRow:
+    """The row of an entry: of the runner with most scenes; the rows of all others are compared with it."""
+    by_runner: dict[str, dict[tuple[str, str], ScoredRow]] = {}
+    for row in rows:
+        by_runner.setdefault(row.by, {})[row.key] = row
+    reference = max(by_runner, key=lambda by: len(by_runner[by]))
+    shown = by_runner.pop(reference)
+
+    reproduced = {}
+    for by, others in by_runner.items():
+        common = [key for key in others if key in shown]
+        words = [agreement(opened, shown[key], others[key])[0] for key in common]
+        agreeing = sum(word != "differs" for word in words)
+        reproduced[by] = (agreeing, words.count("identical"), len(words))
+    errors = [row.ate_m for row in shown.values() if row.ate_m is not None]
+    return BoardRow(
+        entry=entry,
+        median_ate_m=median(errors) if errors else None,
+        scenes=len(shown),
+        not_ok=sum(row.status != "ok" for row in shown.values()),
+        run_by=reference,
+        reproduced=reproduced,
+    )
+
+
+def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
+    """Remarks that hold for all rows."""
+    of = opened.round
+    late = opened.late_entries()
+    remarks = [
+        f"Sealed: {of.scenes} scenes of each of {', '.join(of.families)}, {of.frames} frames; "
+        f"the salt's SHA-256 {of.salt_sha256[:16]} was published before, the salt at {opened.reveal.revealed}.",
+        f"Protocol {of.protocol}; rows agree where errors differ by at most {100 * of.tolerance:g} %.",
+    ]
+    if late:
+        remarks.append(f"Late, not run: {', '.join(late)}.")
+    for by in runners:
+        results = opened.read_results(by)
+        machine = results.machine
+        words = "no network" if results.network == "none" else "with the network open"
+        remarks.append(
+            f"{by}: {len(results.rows)} runs, {words}, on {machine.cpu}, {machine.system}, "
+            f"numpy {results.versions.get('numpy', '')}, numba {results.versions.get('numba', '')}."
+        )
+    return remarks
+
+
+def _markdown(
+    opened: RoundFolder, remarks: list[str], rows: list[BoardRow], faults: list[str]
+) -> str:
+    """The board as a file."""
+    lines = [f"# Sealed round {opened.round.name}", ""]
+    lines += [f"- {remark}" for remark in remarks]
+    lines += ["", f"| {' | '.join(COLUMNS)} |", f"|{' --- |' * len(COLUMNS)}"]
+    lines += [f"| {' | '.join(cell.replace('|', '/') for cell in row.cells)} |" for row in rows]
+    if faults:
+        lines += ["", "## Faults", "", *(f"- {fault}" for fault in faults)]
+    return "\n".join(lines) + "\n"
