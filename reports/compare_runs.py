@@ -171,7 +171,7 @@ def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Pa
 
 
 def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
-    """How to read the table, and in which settings the trackers differ."""
+    """Sentences on reading the table, and on the settings in which the trackers differ."""
     changed = "; ".join(
         f"{name}: {', '.join(words)}" for name, words in differences.items() if words
     )
@@ -321,7 +321,7 @@ def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
 
 
 def _not_current(first: RunRow, second: RunRow) -> int:
-    """How many of two rows are by programs that do not rank."""
+    """Sentence on rows by programs that do not rank."""
     return (not first.is_current) + (not second.is_current)
 
 
@@ -349,6 +349,7 @@ def ratio_of(a: TrackerOnSequence, b: TrackerOnSequence) -> float | None:
 
 def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     """B beside A over the sequences, each recording once."""
+    # a recording that is there under several names counts once
     copies = copies_of({sequence: [*a.rows, *b.rows] for sequence, a, b in paired})
     log_ratios = {}
     lost: list[str] = []
@@ -358,6 +359,7 @@ def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     for sequence, cell_a, cell_b in paired:
         if sequence in copies:
             continue
+        # losses of either side, and the ratio where both have an error
         lost += [sequence] * cell_b.lost
         lost_by_a += [sequence] * cell_a.lost
         runs += min(len(cell_a.kept), len(cell_b.kept))

@@ -50,6 +50,7 @@ PACKAGES = {
         "The gate",
         ["gate", "gate.checking", "gate.config", "gate.result", "evaluation.gate"],
     ),
+    "rounds": ("Sealed rounds", ["rounds", "rounds.files", "sequences.synthetic.sealed"]),
     "testing": ("Checks for plug-ins", ["testing"]),
 }
 """Pages, with their titles and the modules on them."""

@@ -456,7 +456,7 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
 
 
 COMPILED_S = 1.0
-"""How often is looked for compiled kernels."""
+"""Interval between two looks for compiled kernels, seconds."""
 
 
 class WatchedRuns:
@@ -578,7 +578,7 @@ def event_text(event: runs.RunEvent) -> str:
 
 
 def describe_plan(plan: runs.PlannedRuns, store: runs.RunStore, jobs: int, protocol: str) -> str:
-    """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
+    """Number of frames to be tracked, and the expected time by this machine's stored runs of the same trackers."""
     from dynslam_bench.core.fingerprint import this_machine  # loads numpy
 
     plural = "s" if plan.runs != 1 else ""

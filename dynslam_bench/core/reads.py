@@ -29,7 +29,7 @@ ABSENT = ""
 UNREADABLE = "unreadable"
 """Stands for what is there and cannot be read."""
 INSTALLED = "installed"
-"""Where a module was found that lies beside its distribution's metadata; the distribution tells its content."""
+"""Place of a module that lies beside its distribution's metadata; the distribution tells its content."""
 SEARCH_PATHS = ("PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD")
 """Environment variables whose folders count in their order (`Reads.search`)."""
 COMMAND = "command "
@@ -41,11 +41,11 @@ BYTE_CODE_FOLDER = "__pycache__"
 _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not kept: a change within the same tick of the clock would not show."""
 _METADATA = (".dist-info", ".egg-info")
-"""How the names of folders end that hold a distribution's metadata."""
+"""Endings of the names of folders that hold a distribution's metadata."""
 _NOT_CONTENT = ("..", ".pyc", ".dist-info")
 """Lines of a distribution's RECORD with these differ between installations of the same files."""
 _SUFFIXES = tuple(importlib.machinery.all_suffixes())
-"""How files end that Python imports as modules."""
+"""Endings of files that Python imports as modules."""
 
 
 def _sorted(entries: dict[str, str]) -> dict[str, str]:
@@ -353,7 +353,7 @@ class ImportPath:
         return namespace
 
     def place(self, top: str, base_folders: BaseFolders) -> str:
-        """Where a top-level module is found: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
+        """Place of a top-level module: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
         module_file = self.find(top)
         if module_file:
             neighbours = self._names[os.path.dirname(module_file)]

@@ -143,7 +143,7 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
 
         Args:
             xy: Undistorted pixels ``[N, 2]``.
-            raw: The same pixels before the lens was corrected.
+            raw: Raw pixels ``[N, 2]``, as the lens distorts them.
             z: Depths there ``[N]``, metres, 0 or NaN missing.
             depth: The whole depth image ``[H, W]``, whose scatter around each pixel gives the
                 variance.

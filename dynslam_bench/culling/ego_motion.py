@@ -107,7 +107,7 @@ def static_share(
 def rigid_flow(
     frame: FrameBundle, state: FilterState, rows: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where points would have been in the previous frame if only the camera moved.
+    """Positions that points would have had in the previous frame if only the camera moved.
 
     Args:
         frame: The current frame.

@@ -143,7 +143,7 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
 
 
 _ROUNDING = 8 * float(np.finfo(np.float64).eps)
-"""How much of a coordinate the rounding of differences may make up."""
+"""Share of a coordinate that the rounding of differences may make up."""
 _ON_A_LINE = 1e-12
 """Share of the first singular value below which the second one says that the positions lie on a line."""
 
@@ -171,8 +171,9 @@ def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
     """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it.
 
     Args:
-        covariance: C, as in `_nearest_rotation`.
-        orientation: As in `_nearest_rotation`; it decides where C does not.
+        covariance: C ``[3, 3]``, of the true positions with the estimated ones, without units.
+        orientation: Mean of true times inverse estimated orientations ``[3, 3]``, which decides
+            where C does not.
     """
     # tr(R^T C) = cos(angle) (C_xx + C_yy) + sin(angle) (C_yx - C_xy) + C_zz
     degenerate = (

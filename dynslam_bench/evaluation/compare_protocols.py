@@ -1,4 +1,4 @@
-"""How much the protocol alone changes the numbers of one trajectory."""
+"""Comparison of protocols: how much the protocol alone changes the numbers of one trajectory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

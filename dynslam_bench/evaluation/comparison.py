@@ -139,6 +139,7 @@ LARGEST_M = 1e150
 
 
 def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
+    """Refuse a trajectory with a pose farther away than `LARGEST_M`."""
     sizes = np.abs(trajectory.positions).max(axis=1, initial=0.0)
     if len(sizes) and sizes.max() > LARGEST_M:
         at = int(sizes.argmax())
@@ -239,7 +240,7 @@ def match(
 
 
 def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
-    """How the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, may be put on one clock."""
+    """Advice on putting the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, on one clock."""
     own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
     # frame numbers on one side
     if are_frame_numbers(own) != are_frame_numbers(true):
@@ -292,6 +293,7 @@ def nearest_match(
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
+    """Count the associated poses, and the others by the reason why they have no partner; stamps in seconds."""
     # why a pose has no partner: beyond the ends, in a hole, or another was nearer
     unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)

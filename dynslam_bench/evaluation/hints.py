@@ -151,7 +151,7 @@ def _several_recordings(
 
 
 def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float]:
-    """How late the truth has to be read for displacements to agree, and the share of them that then stays unexplained.
+    """Delay with which the truth has to be read for displacements to agree, and the share that then stays unexplained.
 
     Returns:
         Seconds to add to the stamps, 0 without clear evidence, and the share in [0, 1], at any
@@ -355,7 +355,11 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     accuracy = COPY_M if noise > NOISE_M else EXACT_M
     least = min(accuracy, COPY_SHARE * fits[0].extent_m)
     if error < least:
-        text = f"the error of {mm(error)} mm is below what trackers reach: were the poses read from the truth?"
+        # the scale is fitted: without that the error may be larger
+        text = (
+            f"with the scale fitted, the error of {mm(error)} mm is below what trackers reach: were the poses "
+            "read from the truth?"
+        )
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
 
     # the error jitters less than the truth does: the estimate has the same noise
@@ -462,7 +466,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well positions can be aligned, from their moments: Umeyama 1991, Eq. 40-43.
+    """Fit of positions by alignments, from their moments: Umeyama 1991, Eq. 40-43.
 
     Attributes:
         scale: Scale of the Sim(3) alignment.
@@ -484,7 +488,7 @@ class Fit:
 
 
 def fit(poses: Array, truth: Array) -> Fit:
-    """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
+    """Fit of the positions of poses ``[N, 4, 4]`` to those of the true ones by alignments."""
     # positions about their means, their covariance and variances
     own = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     true = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
@@ -628,7 +632,7 @@ def _axes(motions: Array, true: Array) -> Array:
 
 
 def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
-    """How far the motions are from the true ones, and how well they vary with them.
+    """Distance of the motions from the true ones, and how well they vary with them.
 
     Scales are left out. Of rotations and translations those count that are larger than noise.
 

@@ -198,7 +198,7 @@ class OrbExtractor:
 
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
-    """How many features each level gets: in proportion to its side length, `n_features` in all."""
+    """Number of features of each level: in proportion to its side length, `n_features` in all."""
     # a level's share; what rounding down leaves goes to the finest
     shares = scale_factor ** -np.arange(levels, dtype=np.float64)
     quotas = np.floor(n_features * shares / shares.sum()).astype(int)
@@ -236,7 +236,7 @@ def spread(
 
 @kernel
 def _occurrences_before(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """How often each of the numbers ``[N]``, from 0 to `count` - 1, occurs before it."""
+    """Count for each of the numbers ``[N]``, from 0 to `count` - 1, how often it occurs before."""
     # counted while the numbers are read in order
     occurred = np.zeros(count, np.int64)
     before = np.empty(len(numbers), np.int64)

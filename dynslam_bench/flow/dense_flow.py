@@ -965,16 +965,44 @@ def aggregate_and_choose(
             filter_patch(patch[:n], values[:n], pitch, radius, aggregation.epsilon, work)
 
             # Eq. 3: the region's pixels take the label where its cost is the lowest so far
-            for member in region:
-                y = member // columns
-                x = member % columns
-                cost = values[(y - top + radius) * pitch + x - left + radius]
-                if cost < best[y, x]:
-                    best[y, x] = cost
-                    winner[y, x, 0] = u
-                    winner[y, x, 1] = v
-                    winner[y, x, 2] = a
-                    winner[y, x, 3] = b
+            first = (radius - top) * pitch + radius - left
+            take_where_cheaper((u, v, a, b), region, columns, values, pitch, first, best, winner)
+
+
+@inlined
+def take_where_cheaper(
+    label: Similarity,
+    region: Longs,
+    columns: int,
+    values: Floats,
+    pitch: int,
+    first: int,
+    best: Floats,
+    winner: Floats,
+) -> None:
+    """Let the pixels of a region take a label where its aggregated cost is the lowest so far.
+
+    Args:
+        label: The label.
+        region: int64, flat indices of the region's half-resolution pixels.
+        columns: Half-resolution pixels a row.
+        values: float32, flat, aggregated costs of the patch around the region.
+        pitch: Numbers a row of the patch.
+        first: Index in `values` where the image's pixel (0, 0) would lie; may be negative.
+        best: `ChosenLabels.best`, changed.
+        winner: `ChosenLabels.winner`, changed.
+    """
+    u, v, a, b = label
+    for member in region:
+        y = member // columns
+        x = member % columns
+        cost = values[first + y * pitch + x]
+        if cost < best[y, x]:
+            best[y, x] = cost
+            winner[y, x, 0] = u
+            winner[y, x, 1] = v
+            winner[y, x, 2] = a
+            winner[y, x, 3] = b
 
 
 @inlined

@@ -312,7 +312,7 @@ CANDIDATES = 0
 INITIAL = 1
 """The first population."""
 OPPOSITES = 2
-"""Its opposites."""
+"""Opposites of the first population."""
 SEARCH = 3
 """Moths that fly, or labels that are drawn, until the evaluations are spent."""
 
@@ -868,7 +868,7 @@ def ransac_similarity(
 def count_inliers(
     voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar
 ) -> int:
-    """How many voters a motion takes to where their labels do, by squared distance.
+    """Count the voters that a motion takes to where their labels do, by squared distance.
 
     Args:
         voters: float32 ``[4, M]``: x and y of points, and where their labels take them.

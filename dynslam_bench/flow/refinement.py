@@ -265,7 +265,6 @@ def similarity_lucas_kanade(
     # pixels of the window, and scratch arrays for it
     side = 2 * window.radius + 1
     n = np.float64(side * side)
-    half = np.float32(0.5)
     scale_down = np.float32(1) / np.float32(window.step)
     space = make_workspace(window.radius, window.margin)
     for i in range(start, stop):
@@ -285,15 +284,8 @@ def similarity_lucas_kanade(
         if template.energy < n * FLAT_VARIANCE:
             continue
 
-        # the label as a warp; its translation is in pixels of the target with its border
-        scale = np.float32(np.exp2(labels[i, 2]))
-
-        warp = Warp(
-            np.float64(scale * np.float32(np.cos(labels[i, 3]))),
-            np.float64(scale * np.float32(np.sin(labels[i, 3]))),
-            framed(points[i, 0] + labels[i, 0], scale_down),
-            framed(points[i, 1] + labels[i, 1], scale_down),
-        )
+        # warps, beginning with that of the label
+        warp = warp_of_label(labels[i], points[i], scale_down)
         initial = np.float32(-1)
         best = np.float32(-1)
         best_warp = warp
@@ -339,16 +331,37 @@ def similarity_lucas_kanade(
         # the best warp as a label, where it is better than the label that was given
         correlation[i] = best
         if best > initial:
-            a = best_warp.a
-            b = best_warp.b
-            labels[i, 0] = (
-                (best_warp.x - BORDER + half) * np.float32(window.step) - half - points[i, 0]
-            )
-            labels[i, 1] = (
-                (best_warp.y - BORDER + half) * np.float32(window.step) - half - points[i, 1]
-            )
-            labels[i, 2] = half * np.float32(np.log2(a * a + b * b))
-            labels[i, 3] = np.float32(np.arctan2(b, a))
+            store_label(labels[i], points[i], best_warp, window.step)
+
+
+@inlined
+def warp_of_label(label: Floats, point: Floats, scale_down: Scalar) -> Warp:
+    """The warp of a label; its translation is in pixels of the target with its border.
+
+    Args:
+        label: float32 ``[4]``: u, v (full-image pixels), log2 of the scale, rotation (radians).
+        point: float32 ``[2]``, full-image pixels.
+        scale_down: Pixels of the target in a full-image pixel.
+    """
+    scale = np.float32(np.exp2(label[2]))
+    return Warp(
+        np.float64(scale * np.float32(np.cos(label[3]))),
+        np.float64(scale * np.float32(np.sin(label[3]))),
+        framed(point[0] + label[0], scale_down),
+        framed(point[1] + label[1], scale_down),
+    )
+
+
+@inlined
+def store_label(label: Floats, point: Floats, warp: Warp, step: int) -> None:
+    """Write a warp as a label, the inverse of `warp_of_label`; `step`: full-image pixels in a target pixel."""
+    half = np.float32(0.5)
+    a = warp.a
+    b = warp.b
+    label[0] = (warp.x - BORDER + half) * np.float32(step) - half - point[0]
+    label[1] = (warp.y - BORDER + half) * np.float32(step) - half - point[1]
+    label[2] = half * np.float32(np.log2(a * a + b * b))
+    label[3] = np.float32(np.arctan2(b, a))
 
 
 @inlined
@@ -569,7 +582,7 @@ def compare_with_template(
         space: Patch, template and its gradients.
         mean: Mean grey level of the template.
         at: Index of the window's first pixel in the patch.
-        weights: Of the part of a pixel by which the window is shifted.
+        weights: Bilinear weights of the part of a pixel by which the window is shifted.
     """
     # sums over the window, sixteen pixels at a time
     mean_t = spread(mean)

@@ -145,7 +145,7 @@ class Camera:
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
     def undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
+        """Places of an undistorted image's pixels in the distorted one: columns and rows, ``[H, W]``."""
         import cv2
 
         distortion = np.asarray(self.distortion)

@@ -53,7 +53,7 @@ class RoundReport:
     """The board of a round.
 
     Attributes:
-        remarks: What holds for all rows, a line each.
+        remarks: Remarks on the whole board, a line each.
         rows: The entries, the best first.
         faults: What is wrong with the results, a line each; rows of such runners are shown all the
             same.

@@ -30,6 +30,8 @@ TRIAL_SCENE = 100
 """The public scene of the trial: the first held-out one."""
 TRIAL_FRAMES = 60
 """Frames of the trial at most: two seconds."""
+_PROGRAMS = ("subprocess:", "batch:")
+"""How the names of trackers begin that are programs, whose files no package holds."""
 
 
 def enter(
@@ -71,7 +73,12 @@ def enter(
         on_step("running it on a public scene")
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
-    program = program_of(record.identity)
+    program = program_of(name, record.identity)
+    if tracker.startswith(_PROGRAMS) and not program.files:
+        raise RunError(
+            f"the program of '{tracker}' does not lie in entries/{name}: nobody could tell whether it changes",
+            f"put its files into {opened.root / 'entries' / name}, and name them from the round's folder",
+        )
     check_is_new(opened, tracker, program)
     entry = Entry(
         name=name,

@@ -112,7 +112,7 @@ class ResolvedRun:
 
     @cached_property
     def run_id(self) -> str:
-        """Its id; that of a run with plug-ins or programs changes when it is known what they read."""
+        """Id of the run; that of a run with plug-ins or programs changes when it is known what they read."""
         return digest_of_request(self.identity) + self.read_digest
 
     @cached_property

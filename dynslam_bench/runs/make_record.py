@@ -65,7 +65,7 @@ _FIELDS_OF_LAST_MESSAGE = ("keyframes", "map_points", "maps", "finalize_s")
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames of a run were tracked, and how many were not.
+    """Number of frames of a run that were tracked, and that were not.
 
     Attributes:
         total: All frames of the run's part of the sequence.
@@ -274,7 +274,7 @@ def recording_notes(sequence: Sequence) -> list[str]:
 
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:
-    """Where a tracker is found that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
+    """Place of a tracker that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
     folder = run.base_folders.plugin
     return {
         "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,

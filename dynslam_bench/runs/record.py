@@ -22,7 +22,7 @@ ON_RECORDING = "recording: "
 """Begins a run's notes on what of its recording was not used, or what nobody could mean."""
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-"""How a run ended, see `RunRecord`."""
+"""Status of a run that ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 ASKED = (

@@ -602,6 +602,7 @@ class RunStore:
         reasons = [f"{entry.path}: {entry.reason}" for entry in unreadable]
 
         def scored() -> Iterator[tuple[RunRecord, MetricRecord | None]]:
+            """Each readable run with its metrics; those that cannot be read give a reason."""
             for run_id in records.run_ids:
                 try:
                     record = self.read_whole(run_id)

@@ -1,4 +1,4 @@
-"""How many raw units of a recording's depth make a metre of its ground truth, with a 95 % interval.
+"""Measure the raw units of a recording's depth in a metre of its ground truth, with a 95 % interval.
 
 Between two frames the truth gives the rotation, the corners and their depth give the translation.
 Its length is compared with the true one. What else can lie between the two is estimated along: a
@@ -28,7 +28,7 @@ SHIFT_SIGMA_S = 0.01
 READOUT_S = 0.013
 """Mean of a readout time that the camera does not state: from a global shutter to most of a frame."""
 READOUT_SIGMA_S = 0.013
-"""Its standard deviation."""
+"""Standard deviation of that readout time, seconds."""
 STATED_READOUT_SIGMA_S = 0.005
 """Standard deviation of one that it states."""
 SYSTEMATIC = 0.03

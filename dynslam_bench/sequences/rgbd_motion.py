@@ -173,7 +173,7 @@ def follow_corners(
     guess: Pixels,
     tolerance_px: float,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Where corners ``[N, 2]`` of one image lie in the next one, and which were found, by pyramidal Lucas-Kanade.
+    """Find corners ``[N, 2]`` of one image in the next one, and flag those found, by pyramidal Lucas-Kanade.
 
     A corner is found if it lies inside the image and, tracked back, ends where it began.
 

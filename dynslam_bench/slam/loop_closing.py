@@ -133,7 +133,7 @@ class Correction:
         return Correction(self.T_cam_now, self.T_cam_before, 1 / self.scale)
 
     def moved(self, at: Array) -> Array:
-        """Where a place ``[3]`` near the keyframe is after the correction, ``[3]``."""
+        """Move a place ``[3]`` near the keyframe as the correction does, ``[3]``."""
         # in the camera frame, in the new unit; then by the new pose
         local = self.scale * se3.transform(self.T_cam_before, at[None])
         return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])

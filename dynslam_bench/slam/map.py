@@ -751,7 +751,7 @@ def _project(
     scale_factor: float,
     levels: int,
 ) -> tuple[int, Slots, Array, Array, Slots, Array]:
-    """How many of the candidate points the camera should see, and these, see `VisiblePoints`, in longer arrays.
+    """Count the candidate points that the camera should see, and list them, see `VisiblePoints`, in longer arrays.
 
     They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
     side that they were seen from before (ORB-SLAM2's ``isInFrustum``).

@@ -1,4 +1,4 @@
-"""How a hand-held camera moves: white-noise acceleration, as a filter while tracking and a smoother afterwards.
+"""Model of a hand-held camera's motion: white-noise acceleration, as a filter while tracking and a smoother afterwards.
 
 State of the filter: position p and velocity v in the world, orientation R_cam_world and angular
 velocity w in the camera frame; accelerations are white noise. The measurement is the pose that the

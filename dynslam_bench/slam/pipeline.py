@@ -591,7 +591,7 @@ def flow_to_previous(
 
 
 def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32]:
-    """Where the motion model expects this frame's keypoints in the previous image.
+    """Places in the previous image where the motion model expects this frame's keypoints.
 
     Args:
         frame: The current frame.

@@ -53,7 +53,7 @@ WORST = 6
 _APART = 15
 """Frames between two of these at least."""
 _LOG_BYTES = 20_000
-"""How much of the end of a log a page shows."""
+"""Bytes of the end of a log that a page shows."""
 _NO_STAGES = ("total_s", "processor_s", "read_s")
 """Times of a frame that are no stage of it: the figure stacks stages."""
 
@@ -311,7 +311,7 @@ Level = Literal["red", "amber", "green"]
 def run_summary(
     row: RunRow, frames: RunFrames, least: LeastError | None = None
 ) -> tuple[Level, str]:
-    """How a run ended, and why, in one sentence, with its level.
+    """Sentence on how a run ended, and why, with its level.
 
     Red: it failed, or a camera that does not move has no larger error. Amber: frames were lost, the
     trajectory is probably faulty, or the error is more than `CATASTROPHE` times the least on the
@@ -348,7 +348,7 @@ def run_summary(
 
 
 def _far_off_words(score_m: float | None, least: LeastError | None) -> str:
-    """How many times the least error a run has, where that is more than `CATASTROPHE`; else empty."""
+    """Words on how many times the least error a run has, where that is more than `CATASTROPHE`; else empty."""
     if score_m is None or least is None:
         return ""
     ratio = max(score_m, FLOOR_M) / max(least.error_m, FLOOR_M)
@@ -361,7 +361,7 @@ def _far_off_words(score_m: float | None, least: LeastError | None) -> str:
 
 
 def _failure_words(row: RunRow, frames: RunFrames) -> str:
-    """How a failed run ended, and why."""
+    """Sentence on how a failed run ended, and why."""
     reason = f": {row.reason}" if row.reason else ""
     if row.status == "ok":
         return f"Not evaluated{reason}"
@@ -374,7 +374,7 @@ def _failure_words(row: RunRow, frames: RunFrames) -> str:
 
 
 def _loss_words(row: RunRow, frames: RunFrames) -> str:
-    """When tracking was lost first, and what the frame showed; empty where it was not."""
+    """Sentence on when tracking was lost first, and what the frame showed; empty where it was not."""
     lost = np.flatnonzero(frames.columns.get("state", np.array([], str)) == "lost")
     if not len(lost):
         return ""

@@ -226,7 +226,7 @@ class RunRow(RunRecord):
 
     @property
     def ending(self) -> str:
-        """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
+        """End of a failed run, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
         if not self.failed:
             return ""
         if self.status == "lost" and self.coverage is None:
@@ -490,7 +490,7 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
 
 
 def sequence_options(row: RunRow) -> list[str]:
-    """Its part of the sequence, and the camera that its command named, as options of the command line."""
+    """Options of the command line for the run's part of the sequence, and for the camera that its command named."""
     words = []
     if row.frames is not None:
         frames = ":".join("" if end is None else str(end) for end in row.frames)

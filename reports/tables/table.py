@@ -16,7 +16,7 @@ from dynslam_bench.core import printable
 from dynslam_bench.reports.model.names import OUR_BACK_END
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
-"""How a cell is set, see `TableCell`."""
+"""Emphasis with which a cell is set, see `TableCell`."""
 MOST_ROWS = 1000
 """Rows that pages and Markdown show; CSV has all."""
 

@@ -717,6 +717,12 @@ def test_a_damaged_baseline_is_refused_in_one_line(tmp_path, sequences, damage, 
     assert "\n" not in str(caught.value)
     assert caught.value.hint
 
+    # the cure works
+    made = gates.record(question, trajectories=files, results=tmp_path / "results")
+    assert words in made.notes[0]
+    again = gates.check(question, trajectories=files, results=tmp_path / "results")
+    assert again.verdict is GateVerdict.IDENTICAL
+
 
 def test_the_json_fits_its_schema_and_nothing_else_does(tmp_path, sequences) -> None:
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema (extra [test]) is missing")

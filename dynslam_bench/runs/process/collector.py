@@ -517,9 +517,11 @@ class Collector:
         names: set[str] = set()
         set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
         for file in files:
+            # only code of others counts
             stamp = stamp_of(file)
             if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
                 continue
+            # in a source every word that may name a variable, in a library those that are set
             if file.endswith(".py"):
                 content = Path(file).read_bytes()
                 if any(mark in content for mark in marks):
@@ -527,6 +529,7 @@ class Collector:
             elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
                 content = Path(file).read_bytes()
                 names |= {name for name in set_now if os.fsencode(name) in content}
+        # variables that the run itself has set are no input
         names -= {name.removeprefix("$") for name in self.notes.made}
         return {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
 
@@ -573,12 +576,14 @@ class Collector:
         opened_names = set(map(os.path.basename, texts))
         for text in texts:
             for word in self._words(text):
+                # where the file may be, by the folders of the text and of the run
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
                 if not there and word not in opened_names:
                     there = self._files_below(os.path.dirname(text), word)
                     there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
+                # a name in a source may be looked for without being there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
         missing = {path for path in missing if not self.is_output(path)}
@@ -588,7 +593,7 @@ class Collector:
         """The files of that name, or of that ending of a network's file, in all folders below one.
 
         Of a folder with very many files the first ones are looked at; hidden folders, environments,
-        results and recordings are left out (`files_below`).
+        results and images of recordings are left out (`files_below`).
         """
         ending = _UP_TO_PLACEHOLDER.sub("", word)
         is_ending = ending.lower() in (*_NETWORKS, *_ARRAYS_AND_CLOUDS)
@@ -619,7 +624,7 @@ class Collector:
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:
-        """Where a file of that name could lie."""
+        """Places where a file of that name could lie."""
         folders = {os.path.dirname(text), str(self._base_folders.work)}
         if self._base_folders.plugin is not None:
             folders.add(str(self._base_folders.plugin))

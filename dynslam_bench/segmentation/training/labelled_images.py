@@ -419,7 +419,7 @@ def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
 
 
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
-"""How a set of labelled images is named."""
+"""Forms in which a set of labelled images is named."""
 
 
 def open_labelled(text: str) -> LabelledImages:

@@ -25,7 +25,7 @@ MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 EYE_HEIGHT_M = 1.35
 """Height of the camera at rest."""
 TILT_RAD = math.radians(10.0)
-"""How far it looks down."""
+"""Angle by which the camera looks down, radians."""
 _XYZ_M = (0.25, 0.2, 0.25)
 """Amplitudes of `xyz` to the right, down and forward."""
 _XYZ_PERIOD_S = 4.6
@@ -117,7 +117,7 @@ def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Arr
     Args:
         rng: Draws frequencies and phases.
         t: Seconds ``[N]``.
-        amplitude: Of the slowest sine, in the unit of the result.
+        amplitude: Amplitude of the slowest sine, in the unit of the result.
         axes: Number of axes.
     """
     total = np.zeros((len(t), axes))

@@ -305,7 +305,7 @@ _LIGHT = 1.0, 0.1
 _ENTRY_S = 1.8
 """Time in which a person comes in or leaves."""
 _OUTSIDE_M = 3.0
-"""How far from their lane's end they wait outside."""
+"""Distance from their lane's end at which they wait outside, metres."""
 
 
 @dataclass(frozen=True)

@@ -726,7 +726,7 @@ _SHORTEST_BLUR_PX = 0.75
 
 
 def tap_shares() -> Reals:
-    """Where along a blur each of its taps lies, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
+    """Places of a blur's taps, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
     taps = np.arange(MOST_TAPS + 1)[:, None]
     i = np.arange(MOST_TAPS)[None]
     return np.where(i < taps, (i + 0.5) / np.maximum(taps, 1) - 0.5, 0.0)

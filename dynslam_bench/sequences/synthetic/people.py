@@ -206,7 +206,7 @@ class _Figure:
             self.knee_angles.append(walking_knee * (1 - sit) + sit * (1.35 + 0.12 * side))
 
     def _pelvis_position(self, body: Array) -> Array:
-        """Where the pelvis is: above the lower foot or on the seat, and swaying where the person stands."""
+        """Position of the pelvis: above the lower foot or on the seat, and swaying where the person stands."""
         how = self.how
         k = self.size
         # height over the foot of each leg, by the lengths of thigh and shin

@@ -51,7 +51,7 @@ _MARGIN_PX = 2.0
 _SAMPLED_ROWS = 9
 """Rows of a rolling shutter by whose poses primitives are sorted into tiles."""
 _SLACK_M = 0.01
-"""How much nearer than in the sampled rows a primitive may be in another one."""
+"""Metres by which a primitive may be nearer in another row than in the sampled ones."""
 
 _LAMPS = np.array(
     [[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]]
@@ -128,7 +128,7 @@ _EDGES = np.array(
 
 
 def bounds_of(corners: Array) -> Array:
-    """Where in the image boxes can be seen: around the parts of them that lie before the camera.
+    """Bounds of boxes in the image: around the parts of them that lie before the camera.
 
     Args:
         corners: ``[P, 8, 3]`` in the camera frame, metres.

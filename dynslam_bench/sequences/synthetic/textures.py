@@ -263,7 +263,7 @@ def plaid(rng: np.random.Generator, size: int = 256) -> Image:
     t = (np.arange(size) * repeats / size) % 1.0
 
     def bands() -> NDArray[np.float64]:
-        """Where along one axis the second and the third colour have their bands ``[S, 2]``."""
+        """Bands of the second and the third colour along one axis ``[S, 2]``."""
         centres = rng.random(3)
         widths = 0.05 + 0.12 * rng.random(3)
         weight = np.zeros((size, 2))
