@@ -51,7 +51,15 @@ from dynslam_bench.runs.bank_files import (
 )
 from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
-from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, TrajectoryKind, Unreadable
+from dynslam_bench.runs.layout import (
+    COVARIANCES,
+    FINAL,
+    ONLINE,
+    RUN_FILE,
+    STAMPS,
+    TrajectoryKind,
+    Unreadable,
+)
 from dynslam_bench.runs.record import RunRecord, run_id_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, Merged, RunStore, open_store
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -73,7 +81,7 @@ class Bank(RunStore):
     """A results folder that takes of a run what scores are computed from, and nothing of the machine that made it."""
 
     def copy_from(self, other: RunStore, record: RunRecord) -> RunRecord:
-        """Copy the record, the trajectories, the stamps and the ground truth of a run.
+        """Copy the record, the trajectories and their covariances, the stamps and the ground truth of a run.
 
         Raises:
             InfrastructureError: It cannot be written.
@@ -84,7 +92,7 @@ class Bank(RunStore):
         with self.work_folder(record.run_id) as work:
             # the run's own files, read while nobody changes them
             with self.copying(other, record):
-                for name in (ONLINE, FINAL):
+                for name in (ONLINE, FINAL, COVARIANCES):
                     file = other.folder(record.run_id) / name
                     if file.is_file():
                         shutil.copyfile(file, work / name)

@@ -38,6 +38,7 @@ _CONTEXT: dict[str, Any] = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "extract": "cr:extract",
     "field": "cr:field",
@@ -59,6 +60,7 @@ _CONTEXT: dict[str, Any] = {
     "regex": "cr:regex",
     "repeated": "cr:repeated",
     "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
     "sc": "https://schema.org/",
     "separator": "cr:separator",
     "source": "cr:source",
@@ -66,6 +68,9 @@ _CONTEXT: dict[str, Any] = {
     "transform": "cr:transform",
 }
 """The context of the specification, with the prefixes of RAI and PROV."""
+_CITATION = (
+    "dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes"
+)
 _LICENCES = {
     "CC0-1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
     "CC BY 4.0": "https://creativecommons.org/licenses/by/4.0/",
@@ -227,7 +232,7 @@ def _facts_of_rendered(folder: Path) -> DatasetFacts:
         title=f"Rendered RGB-D sequence {scene}",
         summary="RGB-D images of a dynamic indoor scene with exact poses, depth and masks, in TUM's layout.",
         licences=("CC0-1.0",),
-        citation="dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes",
+        citation=_CITATION,
         files=(
             FileGroup("rgb", "rgb/*.png", "image/png", "colour images, 640x480, 8 bits"),
             FileGroup("depth", "depth/*.png", "image/png", "depth images, 16 bits, metres x 5000"),
@@ -282,7 +287,7 @@ def _facts_of_minari(folder: Path) -> DatasetFacts:
         title=f"Recordings of SLAM-Control: {name}",
         summary="Episodes of agents that change the settings of a SLAM system at every frame of a rendered sequence.",
         licences=("CC0-1.0",),
-        citation="dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes",
+        citation=_CITATION,
         files=tuple(contents),
         limitations=f"{_RENDERED_LIMITS} Rewards hold for one tracker and its version.",
         biases=f"{_RENDERED_BIASES} Actions are those of the recorded policies.",
@@ -312,6 +317,7 @@ def _facts_of_bank(folder: Path) -> DatasetFacts:
     rendered = [name for name in sequences if name.startswith("synthetic/")]
     recorded = sorted(sequences.keys() - set(rendered))
     derived = [(name, "") for name in recorded]
+    cited = sorted({info.citation for info in sequences.values() if info.citation})
     derived += [(f"{len(rendered)} rendered sequences of dynslam-bench", "")] if rendered else []
     contents = [
         FileGroup("records", "runs/*/run.json", "application/json", "tracker, settings, machine"),
@@ -332,7 +338,7 @@ def _facts_of_bank(folder: Path) -> DatasetFacts:
         summary=f"{len(records)} trajectories of {len(trackers)} SLAM systems on {len(sequences)} sequences, "
         f"with ground truth; errors are under the protocol {protocol.id}.",
         licences=tuple(sorted(licences)),
-        citation="; ".join(sorted({i.citation for i in sequences.values() if i.citation})),
+        citation="; ".join(cited) or _CITATION,
         files=tuple(contents),
         limitations="Errors hold for these sequences, settings and machines. A row that nobody has run again is its "
         "owner's word; an imported one names where it comes from.",
