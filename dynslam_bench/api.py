@@ -75,7 +75,7 @@ class RunResult:
 
     @property
     def status(self) -> str:
-        """How it ended: ``ok``, ``lost``, ``crashed``, ..."""
+        """Status in which it ended: ``ok``, ``lost``, ``crashed``, ..."""
         return self.record.status
 
     @property
@@ -95,7 +95,7 @@ class RunResult:
 
     @property
     def folder(self) -> Path:
-        """Where its files are."""
+        """Folder of its files."""
         return self.store.folder(self.run_id)
 
     def frames(self) -> pd.DataFrame:

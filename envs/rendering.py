@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence, TrackResult
+from dynslam_bench.core.number_text import length_text
 from dynslam_bench.envs.episode import Episode
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
@@ -305,8 +306,7 @@ def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
     cv2.line(plot, (16, y), (16 + pixels, y), _INK, 2)
     for x in (16, 16 + pixels):
         cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
-    words = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-    _text(plot, words, (16, y - 10), _INK, 0.45)
+    _text(plot, length_text(length), (16, y - 10), _INK, 0.45)
 
 
 def _text(

@@ -140,6 +140,7 @@ class ActionMap:
 
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
     """The parameters of the settings that actions change, in the order of `control`; see `ActionMap`."""
+    # a list of names of online settings
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
     online = {
@@ -153,6 +154,7 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
                 fault = f"setting '{name}' may not change in mid-episode"
             hint = did_you_mean(name, online) or "this tracker has no online settings"
             raise SettingsError(fault, hint)
+        # once each, with an effect, and with a finite range for the actions
         parameter = online[name]
         if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")

@@ -507,10 +507,10 @@ class DropFrames(SlamWrapper):
         return min(max(newest, index), last)
 
     def _arrivals(self) -> Any:
-        """When each frame arrives, seconds ``[N]``."""
+        """Times when the frames arrive, seconds ``[N]``."""
         return self._base.sequence.timestamps / self._speed
 
     def _busy_s(self) -> float:
-        """How long the tracker was busy with the last frame, seconds."""
+        """Seconds that the tracker was busy with the last frame."""
         measured_s = self._base.episode.outcomes[-1].timings["total"]
         return measured_s if self._frame_time_s is None else self._frame_time_s

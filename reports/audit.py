@@ -89,7 +89,7 @@ class AuditReport:
         return [finding for finding in self.of(check) if not finding.holds]
 
     def summary(self) -> Table:
-        """How many numbers pass each check."""
+        """Counts of the numbers that pass each check."""
         rows = []
         for check, meaning in CHECKS.items():
             counts = (number(len(self.of(check))), number(len(self.failed(check))))

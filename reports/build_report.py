@@ -320,7 +320,7 @@ def _monocular_boards(loaded: LoadedRuns, boards: Mapping[str, Board]) -> dict[s
 
 
 def pages_for(runs: int, typical: int) -> int:
-    """How many pages a report has where nobody asks for another number: of very many runs most are never opened.
+    """Pages of a report where nobody asks for another number: of very many runs most are never opened.
 
     Args:
         runs: Runs of the report.
@@ -526,7 +526,7 @@ def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
 
 
 def _speed_caption(content: _Content) -> str:
-    """How to read the figure of accuracy against speed."""
+    """Sentences on reading the figure of accuracy against speed."""
     board = content.board
     sentences = []
     if len(content.boards) > 1:
@@ -662,7 +662,7 @@ def _common_notes(protocol: Protocol, loaded: LoadedRuns, pageless: str) -> list
 
 
 def _left_out_note(loaded: LoadedRuns) -> str:
-    """How many runs are in no table, by reason; empty for none."""
+    """Sentence on runs that are in no table, by reason; empty for none."""
     left_out = {
         "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
         "runs that were stopped on request": loaded.stopped,

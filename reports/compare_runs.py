@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
@@ -23,11 +24,11 @@ from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.html.board_page import cell_data, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import TrackerOnSequence, copies_of, make_cell, mean_of
+from dynslam_bench.reports.model.board import TrackerOnSequence, copies_of, make_cell, mean_coverage
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
-from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
+from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
 
@@ -170,7 +171,7 @@ def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Pa
 
 
 def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
-    """How to read the table, and in which settings the trackers differ."""
+    """Sentences on reading the table, and on the settings in which the trackers differ."""
     changed = "; ".join(
         f"{name}: {', '.join(words)}" for name, words in differences.items() if words
     )
@@ -320,7 +321,7 @@ def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
 
 
 def _not_current(first: RunRow, second: RunRow) -> int:
-    """How many of two rows are by programs that do not rank."""
+    """Sentence on rows by programs that do not rank."""
     return (not first.is_current) + (not second.is_current)
 
 
@@ -348,6 +349,7 @@ def ratio_of(a: TrackerOnSequence, b: TrackerOnSequence) -> float | None:
 
 def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     """B beside A over the sequences, each recording once."""
+    # a recording that is there under several names counts once
     copies = copies_of({sequence: [*a.rows, *b.rows] for sequence, a, b in paired})
     log_ratios = {}
     lost: list[str] = []
@@ -357,6 +359,7 @@ def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     for sequence, cell_a, cell_b in paired:
         if sequence in copies:
             continue
+        # losses of either side, and the ratio where both have an error
         lost += [sequence] * cell_b.lost
         lost_by_a += [sequence] * cell_a.lost
         runs += min(len(cell_a.kept), len(cell_b.kept))
@@ -435,8 +438,8 @@ def _error_cell(cell: TrackerOnSequence) -> TableCell:
 
 def _coverage_cell(cell: TrackerOnSequence) -> TableCell:
     """The mean coverage of runs."""
-    coverage = mean_of(row.coverage for row in cell.rows)
-    return TableCell(coverage_text(coverage), value=coverage)
+    coverage, truth_share = mean_coverage(cell.rows)
+    return TableCell(coverage_text(coverage, truth_share), value=coverage)
 
 
 def _all_sequences(ratio: PairedRatio) -> str:

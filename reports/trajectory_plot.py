@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.envs.rendering import VIEWS, main_view
 from dynslam_bench.geometry import Array, Trajectory, se3
 from dynslam_bench.reports.figures import COLOURS, DASHES, NEUTRAL, safe
-from dynslam_bench.reports.tables.table import mm
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go

@@ -129,7 +129,7 @@ class Candidate(Record):
 
     @property
     def evidence(self) -> PairedRatio | None:
-        """Its ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
+        """Ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
         return self.confirm if self.held_out is None else self.held_out
 
     @property
@@ -346,7 +346,7 @@ _TOO_MANY = 1000
 
 
 def _settling(spec: StudySpec, best: Candidate) -> list[str]:
-    """How many scenes would settle it, the command, and how long that runs; empty where nobody can tell."""
+    """Number of scenes that would settle it, the command, and how long that runs; empty where nobody can tell."""
     evidence = best.evidence
     if evidence is None or best.failed or not best.feasible:
         return []
@@ -373,7 +373,7 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
 
 
 def _further_scenes(spec: StudySpec, best: Candidate) -> int:
-    """How many scenes the next look of an extendable study adds; 0 where no look would settle it."""
+    """Number of scenes that the next look of an extendable study adds; 0 where no look would settle it."""
     evidence = best.evidence
     needed = None if evidence is None else scenes_to_settle(evidence)
     if evidence is None or needed is None or needed > max(LOOKS) or not spec.extendable:
@@ -607,7 +607,7 @@ def _best_trials(tuner: Study) -> list[Candidate]:
 
 
 def without_effect(tuner: Study) -> int:
-    """How many trials had other settings than trial 0, where all of them gave its trajectories to the last bit.
+    """Number of trials with other settings than trial 0, where all of them gave its trajectories to the last bit.
 
     Such settings change nothing: a program may ignore them. 0 where a trial gave another trajectory,
     or there is none to compare.

@@ -419,6 +419,7 @@ def own_objective(cost: Cost) -> Objective:
     name = getattr(cost, "__name__", "own").strip("<>")
 
     def checked(run: Outcome) -> float:
+        """The cost of a run, which must be a number above 0."""
         given: Any = cost(run)
         try:
             value = float(given)
@@ -480,7 +481,7 @@ def violations(
     baseline: Outcomes | None = None,
     constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
 ) -> dict[str, float]:
-    """How far each constraint is violated, relatively; <= 0 is fulfilled.
+    """Relative violation of each constraint; <= 0 is fulfilled.
 
     Args:
         spec: The study. One of anything but error alone must not pay for its gain with accuracy:

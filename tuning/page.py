@@ -11,6 +11,7 @@ import plotly.graph_objects as go
 from optuna.trial import TrialState
 
 from dynslam_bench.core import read_text, setting_text, write_atomic
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.evaluation.verdicts import ComparisonVerdict, PairedRatio
 from dynslam_bench.reports.build_report import sections_page
@@ -24,7 +25,6 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     csv_text,
-    mm,
     number,
     numbers,
 )
@@ -483,6 +483,7 @@ def _candidates(summary: StudySummary) -> Table:
     """The table of the best trials, as they were judged again on the splits."""
 
     def ratio(value: PairedRatio | None) -> TableCell:
+        """A cell with a ratio, its interval and the number of scenes."""
         if value is None or value.ratio is None:
             return TableCell()
         scenes_text = f"{value.scenes} of {value.all_scenes}"
@@ -491,6 +492,7 @@ def _candidates(summary: StudySummary) -> Table:
         )
 
     def losses(candidate: Candidate) -> TableCell:
+        """A cell with the scenes lost by the candidate and by the baseline."""
         evidence = candidate.evidence
         if evidence is None:
             return TableCell()

@@ -317,7 +317,7 @@ class StudyPlan:
         return tried + chosen + judged
 
     def violations(self, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
-        """How far each constraint is violated, see `objectives.violations`."""
+        """Violation of each constraint, see `objectives.violations`."""
         return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
@@ -746,7 +746,7 @@ def _same_image(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
 
 
 def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
-    """Where a system's masks come from; the embedded network for ``auto`` where everything is rendered.
+    """Source of a system's masks; the embedded network for ``auto`` where everything is rendered.
 
     Args:
         settings: Settings of the system.

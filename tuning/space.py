@@ -129,6 +129,7 @@ class SearchSpace:
         """The tracker first, then switches of whole groups, other choices, and numbers; each behind its conditions."""
 
         def rank(parameter: Parameter) -> int:
+            """Position of a parameter's kind: tracker, switch of a group, other choice, number."""
             if parameter.name == TRACKER:
                 return 0
             if parameter.name.endswith(".enabled"):

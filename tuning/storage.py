@@ -1,4 +1,4 @@
-"""Where a study is stored: a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials.
+"""Storage of a study: a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials.
 
 From the top: the best trials and the Pareto front; the trials as a pandas frame; importances of the
 settings; opening a storage; which workers of a study are alive; the journal file.
@@ -123,7 +123,7 @@ def front_trials(study: optuna.Study) -> list[FrozenTrial]:
 
 
 def count_states(study: optuna.Study) -> dict[str, int]:
-    """How many trials are complete, pruned, fail, running, waiting; states without a trial are left out."""
+    """Number of trials that are complete, pruned, fail, running, waiting; states without a trial are left out."""
     return dict(Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False)))
 
 
@@ -211,7 +211,7 @@ _RESAMPLES = 50
 
 
 class Importance(Record):
-    """How much a parameter matters, as a share of all, with its 95 % interval over resampled trials (bootstrap)."""
+    """Importance of a parameter as a share of all, with its 95 % interval over resampled trials (bootstrap)."""
 
     share: float
     low: float
@@ -369,7 +369,7 @@ def worker_name() -> str:
 
 
 def started(pid: int) -> str:
-    """When a process started, as its system counts: clock ticks since the boot on Linux, which no clock changes.
+    """Start time of a process as its system counts: clock ticks since the boot on Linux, which no clock changes.
 
     Raises:
         psutil.NoSuchProcess: There is none of this number.
@@ -390,7 +390,7 @@ _START_TIME = 19
 
 @cache
 def _machine() -> str:
-    """Where process numbers are the same: the host, and on Linux its boot and the namespace, e.g. of a container."""
+    """Name of the place in which process numbers are unique: the host, and on Linux its boot and namespace."""
     names = [socket.gethostname()]
     with suppress(OSError):
         names.append(Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8])

@@ -87,11 +87,11 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.judgement import StudySummary
 
 _WAIT_S = 2.0
-"""How often a worker without a trial looks whether those of the others have ended."""
+"""Interval at which a worker without a trial looks whether those of the others have ended, seconds."""
 _NAMES_S = 0.2
-"""How often it is looked whether running trials have their workers' names."""
+"""Interval at which it is looked whether running trials have their workers' names, seconds."""
 _BEGINNING_S = 10.0
-"""How long to wait for a worker that is beginning the study on the same storage."""
+"""Seconds to wait for a worker that is beginning the study on the same storage."""
 _PRUNED_AFTER = "pruned_after"
 """User attribute: after how many instances the pruner ended a trial. Optuna's pruner gives its answer once."""
 SUMMARY_FILE = "summary.json"
@@ -179,6 +179,7 @@ class Study(StudyPlan):
         callbacks: Iterable[Callable[[optuna.Study, FrozenTrial], object]] = (),
         **fields: Any,
     ) -> None:
+        # the spec, with the fields that are given in place of its own
         base = read_study(spec) if isinstance(spec, Path | str) else spec
         changes = {key: _texts(value) for key, value in fields.items()}
         # by name they are fields of the spec
@@ -195,6 +196,8 @@ class Study(StudyPlan):
             values = {"name": "study"} if base is None else base.model_dump()
             base = validated(StudySpec, values | changes, "the study", StudyError)
         super().__init__(base, results, objectives=objectives, constraints=constraints)
+
+        # pruner, callbacks, and what the study depends on
         self._has_own_pruner = pruner is not None
         self._pruner = pruner or build_pruner(base.pruner)
         self._callbacks = tuple(callbacks)
@@ -203,11 +206,15 @@ class Study(StudyPlan):
         self._identity = self._identify()
         if constraints:
             self._identity["constraints"] = sorted(constraints)
+
+        # the state of this worker's threads
         self._lock = threading.RLock()
         self._interrupted = threading.Event()
         self._is_exhausted = False
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
+
+        # the stored study, or a new one
         self.study = self._open(sampler or StreamedSampler(base), list(self._beginnings()))
         self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:
@@ -215,7 +222,7 @@ class Study(StudyPlan):
 
     @property
     def sampler_name(self) -> str:
-        """Who proposes settings: the spec's sampler, or the class of the one that was given."""
+        """Proposer of settings: the spec's sampler, or the class of the one that was given."""
         sampler = self.study.sampler
         if isinstance(sampler, StreamedSampler):
             return self.spec.sampler
@@ -223,7 +230,7 @@ class Study(StudyPlan):
 
     @property
     def pruner_name(self) -> str:
-        """Who prunes trials: the spec's pruner, or the class of the one that was given."""
+        """Pruner of trials: the spec's, or the class of the one that was given."""
         return type(self._pruner).__name__ if self._has_own_pruner else self.spec.pruner
 
     @property
@@ -233,7 +240,7 @@ class Study(StudyPlan):
 
     @property
     def trials(self) -> int:
-        """How many finished trials the study asks for."""
+        """Number of finished trials that the study asks for."""
         return self.spec.trials + self.extension["trials"]
 
     def extend(self, *, scenes: int = 0, trials: int = 0) -> None:
@@ -781,11 +788,11 @@ class Study(StudyPlan):
             time.sleep(0.05)
 
     def _is_half_begun(self, study: optuna.Study) -> bool:
-        """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
+        """Whether a process of this toolkit began the stored study and was killed before it had an identity."""
         facts = study.user_attrs
         if "identity" in facts:
             return False
-        # as a storage holds it: tuples are lists there
+        # another program's study has trials or attributes of its own; tuples are lists in a storage
         spec = json.loads(json.dumps(self.spec.for_others()))
         is_empty = not facts and not study.get_trials(deepcopy=False)
         return facts.get("spec") == spec or is_empty

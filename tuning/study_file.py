@@ -356,6 +356,7 @@ class Range(Record, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _from_ends(cls, given: Any) -> Any:
+        """Take a range that is written as ``[low, high]``."""
         if isinstance(given, list | tuple):
             if len(given) != 2:
                 raise ValueError("write a range as [low, high]")
@@ -364,6 +365,7 @@ class Range(Record, frozen=True):
 
     @model_validator(mode="after")
     def _check_ends(self) -> "Range":
+        """Refuse a range that ends below its beginning, or has both a log scale and a step."""
         if self.low >= self.high:
             raise ValueError(f"the range ends at {self.high:g}, below its beginning {self.low:g}")
         if self.scale == "log" and self.step:
@@ -401,6 +403,7 @@ class SpaceSpec(Record, frozen=True):
     @model_validator(mode="before")
     @classmethod
     def _read(cls, given: Any) -> Any:
+        """Bring the ways in which a space may be written into one: nested tables, and Optuna's distributions."""
         if not isinstance(given, dict):
             return given
         values = dict(given)

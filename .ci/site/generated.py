@@ -1,12 +1,13 @@
 """Reference pages that are made of the code: its docstrings, settings, command line, trackers and protocols.
 
-python .ci/site/generated.py      # write those of docs/reference/ again
+python .ci/site/generated.py      # write those of docs/reference/ again, and the JSON Schemas
 """
 
 from __future__ import annotations
 
 import inspect
 import itertools
+import json
 import re
 import textwrap
 from pathlib import Path
@@ -15,6 +16,7 @@ from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core.settings import Settings, flatten, settings_table
 from dynslam_bench.envs import STATS_LAYOUT
 from dynslam_bench.evaluation import PROTOCOLS
+from dynslam_bench.gate import GateResult
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.published import KINDS, lines_of, records
 from dynslam_bench.runs import RunRecord, load_frames
@@ -48,6 +50,7 @@ PACKAGES = {
         "The gate",
         ["gate", "gate.checking", "gate.config", "gate.result", "evaluation.gate"],
     ),
+    "rounds": ("Sealed rounds", ["rounds", "rounds.files", "sequences.synthetic.sealed"]),
     "testing": ("Checks for plug-ins", ["testing"]),
 }
 """Pages, with their titles and the modules on them."""
@@ -57,6 +60,9 @@ HEADER = ("sequence", "m", "system", "input", "alignment", "protocol", "hardware
 
 MADE = "<!-- Made by python .ci/site/generated.py -->\n\n"
 """First line of a page that the repository holds; it is not edited by hand."""
+
+JSON_SCHEMA = "https://json-schema.org/draft/2020-12/schema"
+"""The dialect that pydantic writes."""
 
 MANY = 6
 """More trackers than this that share a group of settings are counted, not named."""
@@ -74,12 +80,23 @@ def reference_pages() -> dict[str, str]:
     return {f"reference/{name}.md": MADE + text.strip() + "\n" for name, text in pages.items()}
 
 
+def schemas() -> dict[str, str]:
+    """JSON Schemas that are installed with the package, by their path below the checkout."""
+    schema = GateResult.model_json_schema(mode="serialization")
+    text = json.dumps({"$schema": JSON_SCHEMA} | schema, indent=1) + "\n"
+    return {"dynslam_bench/gate/gate.schema.json": text}
+
+
 def docstring_pages() -> dict[str, str]:
-    """Markdown of the pages of docstrings, which only the site shows, by their path on it."""
+    """Markdown of the pages of docstrings, which only the site shows, by their path on it.
+
+    The search ranks them behind the guides, whose words they repeat.
+    """
     pages = {}
+    behind = "---\nsearch:\n  boost: 0.01\n---\n\n"
     for name, (title, modules) in PACKAGES.items():
         sections = [f"## {module}\n\n::: dynslam_bench.{module}\n\n" for module in modules]
-        pages[f"reference/python/{name}.md"] = f"# {title}\n\n" + "".join(sections)
+        pages[f"reference/python/{name}.md"] = f"{behind}# {title}\n\n" + "".join(sections)
     return pages
 
 
@@ -271,5 +288,7 @@ def _held_by(trackers: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    for page, text in reference_pages().items():
-        (Path(__file__).resolve().parents[2] / "docs" / page).write_text(text, encoding="utf-8")
+    checkout = Path(__file__).resolve().parents[2]
+    pages = {f"docs/{page}": text for page, text in reference_pages().items()}
+    for file, text in (pages | schemas()).items():
+        (checkout / file).write_text(text, encoding="utf-8")

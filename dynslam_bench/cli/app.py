@@ -69,7 +69,7 @@ app.add_typer(gates.app, name="gate", rich_help_panel=REPORT)
 app.add_typer(rounds.app, name="round", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 cache = typer.Typer(
-    help="What is kept to be computed once: stages of the pipeline, compiled kernels, rendered frames.",
+    help="What is computed once and kept: stages, compiled kernels, rendered frames.",
     no_args_is_help=True,
 )
 app.add_typer(cache, name="cache", rich_help_panel=CARE)

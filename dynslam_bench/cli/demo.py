@@ -26,6 +26,7 @@ from dynslam_bench.cli.running import WatchedRuns
 from dynslam_bench.cli.studies import StudyBar, silence_optuna
 from dynslam_bench.core import find_data_root, write_atomic
 from dynslam_bench.core.folders import kernel_files
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.plugins import python_command
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def demo(
     results: Results = Path("results"),
     frames: Annotated[int, typer.Option(min=20, help="Frames of each sequence.")] = 60,
     jobs: Jobs = 2,
-    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 6,
+    trials: Annotated[int, typer.Option(min=2, help="Trials of the small study.")] = 5,
 ) -> None:
     """Run trackers on rendered sequences, report them, tune one: all steps, with no download."""
     from functools import partial
@@ -99,7 +100,7 @@ def demo(
     )
 
     note("making the report")
-    paths = report(store.root, title="Demo: walking and sitting people, rendered")
+    paths = report(store.root, title="Demo: walking people and a balloon, rendered")
 
     tuned = tune_small_study(study, store.root / "study", jobs)
     show_outcome(store, paths, tuned)
@@ -211,10 +212,10 @@ def culling_effect(rows: Iterable[RunRow]) -> list[str]:
         elif factor <= 1 / MIN_FACTOR:
             verdict = f"Culling makes the error {1 / factor:.1f} times larger."
         shown = [
-            f"{1e3 * error:.1f} mm with {CULLING[tracker]} ({tracker})"
+            f"{mm(error)} mm with {CULLING[tracker]} ({tracker})"
             for tracker, error in culled.items()
         ]
-        without = f"{1e3 * by_tracker[STATIC]:.1f} mm without culling ({STATIC})"
+        without = f"{mm(by_tracker[STATIC])} mm without culling ({STATIC})"
         lines.append(f"{name}: {without}, {', '.join(shown)}. {verdict}")
     return [
         *lines,

@@ -106,7 +106,7 @@ def record(
     lost = sum(run.is_lost for run in made.runs)
     revision = made.origin.revision[:12] or "no revision"
     words = f"{len(made.runs)} runs recorded, of {revision}, {lost} lost; commit the file"
-    present(made, words)
+    present(made, words, *(f"note: {note}" for note in made.notes))
 
 
 @app.command()

@@ -91,7 +91,7 @@ def note(text: str) -> None:
 def announce(text: str) -> None:
     """Write a line to standard error, on a terminal or not; none with ``--json``."""
     if not _json_mode:
-        warn(text)
+        warn(_broken(text, _terminal_width()) if sys.stderr.isatty() else text)
 
 
 def warn(text: str) -> None:
@@ -102,7 +102,9 @@ def warn(text: str) -> None:
 def write_error(error: DynslamError) -> None:
     """Write an error to standard error: its headline in one line, each cure below it, then the file to copy."""
     line = printable(" ".join(f"error: {error.headline}".split()))
-    sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
+    if sys.stderr.isatty():
+        line = f"\033[31m{_broken(line, _terminal_width())}\033[0m"
+    sys.stderr.write(f"{line}\n")
     for option in error.options:
         warn(f"  - {' '.join(option.split())}")
     for line in error.template.splitlines():
@@ -128,7 +130,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
         sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")
     else:
         for line in lines:
-            write(line)
+            # tables have several lines, and the width of the terminal
+            write(line) if "\n" in line else write_prose(line)
     if not verified:
         raise typer.Exit(VERIFICATION_FAILED)
 
@@ -162,7 +165,8 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
             lines.append(_GAP.join(padded).rstrip())
     left_out = cells[0][len(widths) :]
     if left_out:
-        lines.append(f"(no room for: {', '.join(left_out)}; dynslam-bench --wide shows all)")
+        note = f"(no room for: {', '.join(left_out)}; dynslam-bench --wide shows all)"
+        lines.append(wrapped(note))
     return "\n".join(lines)
 
 
@@ -211,14 +215,22 @@ def _cell_lines(text: str, width: int) -> list[str]:
 
 
 def fields(facts: Mapping[str, object]) -> str:
-    """Names and values below each other; empty values are left out."""
+    """Names and values below each other; empty values are left out.
+
+    On a terminal long values are broken at blanks, but for a command and a path, which people copy.
+    """
     shown = {
         name: cell_text(value)
         for name, value in facts.items()
         if value not in (None, "", (), [], {})
     }
     width = max(map(len, shown), default=0)
-    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in shown.items())
+    lines = []
+    for name, value in shown.items():
+        first = f"{name.ljust(width)}  {value}"
+        is_whole = name == "command" or " " not in value or not sys.stdout.isatty()
+        lines.append(first if is_whole else wrapped(first, indent=width + 2))
+    return "\n".join(lines)
 
 
 def cell_text(value: object) -> str:
@@ -253,10 +265,26 @@ def report_table(source: Table, names: Sequence[str] = (), most: int | None = No
     return table([titles[at] for at in chosen], rows)
 
 
-def wrapped(text: str) -> str:
-    """Text in lines as wide as the terminal, 120 characters at most; that many where there is none."""
+def wrapped(text: str, indent: int = 0) -> str:
+    """Text in lines as wide as the terminal, 120 characters at most; that many where there is none.
+
+    Args:
+        text: The text.
+        indent: Blanks before all lines but the first.
+    """
     width = min(_terminal_width(), _LINE_WIDTH) if sys.stdout.isatty() else _LINE_WIDTH
-    return textwrap.fill(text, width)
+    return _broken(text, width, indent)
+
+
+def _broken(text: str, width: int, indent: int = 0) -> str:
+    """Text broken at blanks alone: names such as `orb-slam2`, ids and paths stay whole."""
+    return textwrap.fill(
+        text,
+        width,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _terminal_width() -> int:

@@ -270,7 +270,7 @@ def published(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the published errors of a sequence: whose, how measured, and how far those of one system differ."""
+    """Show the published errors of a sequence: whose, how measured, and their spread."""
     from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.reports.model.published import published_for, spans
     from dynslam_bench.reports.tables.published import published_table, span_table

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
 
 app = typer.Typer(
-    help="Sealed rounds: trackers are frozen first, scenes that nobody could know are rendered afterwards.",
+    help="Sealed rounds: trackers are frozen first, their scenes are rendered afterwards.",
     no_args_is_help=True,
 )
 Folder = Annotated[Path, typer.Argument(metavar="ROUND", help="The round's folder.")]
@@ -197,7 +197,7 @@ def verify(
 
     _leave_network()
     with _progress("verifying") as (on_step, on_event):
-        found = rounds.verify(
+        verification = rounds.verify(
             folder,
             by=by,
             of=of or (),
@@ -217,15 +217,15 @@ def verify(
             _millimetres(again.ate_again_m),
             again.agreement,
         )
-        for again in found.rerun
+        for again in verification.rerun
     ]
-    lines = [f"{len(found.rows)} rows scored again, {len(found.rerun)} run again"]
+    lines = [f"{len(verification.rows)} rows scored again, {len(verification.rerun)} run again"]
     if rows:
         columns = ("entry", "scene", "run by", "ATE (mm)", "again (mm)", "")
         lines.append(table(columns, rows))
-    lines += [f"fault: {fault}" for fault in found.faults]
-    lines.append(f"{len(found.faults)} faults" if found.faults else "no fault")
-    present(found, *lines, verified=found.ok)
+    lines += [f"fault: {fault}" for fault in verification.faults]
+    lines.append(f"{len(verification.faults)} faults" if verification.faults else "no fault")
+    present(verification, *lines, verified=verification.ok)
 
 
 @app.command()

@@ -303,7 +303,7 @@ def bench(
     help_all: opts.HelpAll = False,
     as_json: opts.AsJson = False,
 ) -> None:
-    """Run a suite: every tracker on every sequence with every seed; a second call continues an interrupted one."""
+    """Run a suite: every tracker on every sequence with every seed; called again it goes on."""
     from dynslam_bench.api import bench as run_suite
     from dynslam_bench.sequences.catalogue import parse_frames
 
@@ -456,7 +456,7 @@ def confirm_fetch(checkpoint: Checkpoint) -> bool:
 
 
 COMPILED_S = 1.0
-"""How often is looked for compiled kernels."""
+"""Interval between two looks for compiled kernels, seconds."""
 
 
 class WatchedRuns:
@@ -477,8 +477,11 @@ class WatchedRuns:
     def __init__(
         self, store: runs.RunStore, jobs: int, protocol: str, folders: Iterable[str] = ()
     ) -> None:
+        from dynslam_bench.runs.spec import place_of
+
         self.store = store
-        self._to_announce = set(folders)
+        # as the runs name them
+        self._to_announce = set(map(place_of, folders)) - {""}
         self.jobs = jobs
         self.protocol = protocol
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
@@ -575,7 +578,7 @@ def event_text(event: runs.RunEvent) -> str:
 
 
 def describe_plan(plan: runs.PlannedRuns, store: runs.RunStore, jobs: int, protocol: str) -> str:
-    """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
+    """Number of frames to be tracked, and the expected time by this machine's stored runs of the same trackers."""
     from dynslam_bench.core.fingerprint import this_machine  # loads numpy
 
     plural = "s" if plan.runs != 1 else ""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from dynslam_bench import runs as stored
+from dynslam_bench.cli.metric_tables import statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
     DataRoot,
@@ -48,6 +49,7 @@ from dynslam_bench.core import (
     translate_errors,
     write_atomic,
 )
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
@@ -56,9 +58,9 @@ if TYPE_CHECKING:
 COLUMNS = {
     "run": "run_id",
     "tracker": "tracker",
+    "ATE (mm)": "ate_rmse_m",
     "sequence": "sequence",
     "status": "status",
-    "ATE (mm)": "ate_rmse_m",
     "ms/frame": "frame_ms",
     "frames": "frames",
     "repeat": "repeat",
@@ -194,7 +196,7 @@ def show(
             lines += [
                 "",
                 f"{which}: {evaluation.summary()}",
-                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                statistics_table(evaluation.metrics),
                 *evaluation.diagnostics,
             ]
     lines += metrics.remarks
@@ -498,6 +500,8 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    from dynslam_bench.runs.record import coverage_text
+
     # empty and zero values stand for "nothing to say"
     identity = "unverified: its id does not tell the contents of data and code"
     return {
@@ -509,11 +513,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
         "sequence": record.sequence.id,
         "frames": stored.part_words(record),
-        "n_frames": record.n_frames,
-        "tracked": record.n_tracked,
+        "tracked": record.poses_words,
         "lost": record.n_lost,
         "initialising": record.n_initialising or None,
-        "coverage": record.coverage,
+        "coverage": coverage_text(record.coverage, record.truth_share),
         "repeat": record.repeat,
         "masks": record.segmentation,
         "device": record.device,
@@ -560,6 +563,19 @@ def show_runs(
     return rows
 
 
+def covariance_words(row: Mapping[str, Any]) -> str:
+    """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
+    parts = []
+    for span, over in (("1f", "one frame"), ("1s", "one second")):
+        ratio = row.get(f"nees_{span}_mean")
+        if ratio is not None:
+            within = row.get(f"within95_{span}", 0.0)
+            parts.append(
+                f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
+            )
+    return ", ".join(parts)
+
+
 def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     """Show a single run in a few lines: its errors in millimetres, its trajectory, what is to be said of it."""
     record = store.read_whole(row["run_id"])
@@ -570,10 +586,10 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
     # the error beside that of a camera that does not move
     error = ""
     if row["ate_rmse_m"] is not None:
-        error = f"{millimetres(row['ate_rmse_m'])} mm"
+        error = f"{mm(row['ate_rmse_m'])} mm"
     static_m = row["static_camera_ate_rmse_m"]
     if error and static_m and row["false_motion_max_m"] is None:
-        error += f", not moving {millimetres(static_m)} mm"
+        error += f", not moving {mm(static_m)} mm"
     false_motion = row["false_motion_max_m"]
 
     # the trajectories that the run left
@@ -584,8 +600,9 @@ def show_run(row: Mapping[str, Any], store: stored.RunStore) -> None:
             trajectories[name] = str(path)
     facts = {
         "ATE": error,
-        "false motion": "" if false_motion is None else f"{millimetres(false_motion)} mm at most",
-        "frames": f"{record.n_tracked} of {record.n_frames} tracked",
+        "false motion": "" if false_motion is None else f"{mm(false_motion)} mm at most",
+        "covariances": covariance_words(row),
+        "tracked": record.poses_words,
         "time": "" if row["frame_ms"] is None else f"{row['frame_ms']:.3g} ms a frame",
         "settings": shown_cell("settings", row["settings"]),
         "masks": shown_cell("segmentation", row["segmentation"]),
@@ -694,18 +711,12 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     return {run_id: run_id[:count] for run_id, count in digits.items()}
 
 
-def millimetres(metres: float) -> str:
-    """Metres as millimetres with three significant digits."""
-    value = f"{1000.0 * metres:#.3g}"
-    return f"{1000.0 * metres:.0f}" if "e+" in value else value.rstrip(".")
-
-
 def shown_cell(name: str, value: Any) -> Any:
     """A cell of the table: errors in millimetres, paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
     if name in _IN_METRES and isinstance(value, float):
-        return millimetres(value)
+        return mm(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 

@@ -37,7 +37,7 @@ Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
 
 @app.callback()
 def silence_optuna() -> None:
-    """Studies: tune a tracker's settings through its environment."""  # the group's help
+    """Silence Optuna's messages before every command of the group."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)

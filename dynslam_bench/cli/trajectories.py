@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Optional
 import typer
 
 from dynslam_bench import runs
+from dynslam_bench.cli.metric_tables import comparison_table, statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
     Camera,
@@ -21,7 +21,7 @@ from dynslam_bench.cli.options import (
     Timestamps,
     names_of,
 )
-from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, cell_text, present, table
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, present, table
 from dynslam_bench.cli.runs import show_runs
 
 if TYPE_CHECKING:
@@ -75,55 +75,17 @@ def evaluate(
     # one file in full
     if len(scored) == 1:
         result, likely = scored[0]
-        lines = [result.summary(), result.protocol, statistics_table(result)]
+        lines = [result.summary(), result.protocol, statistics_table(result.metrics)]
         present(facts[0], *lines, *remarks(result, likely), *written)
         return
     # several side by side, with the remarks on each
-    lines = [scored[0][0].protocol, comparison_table(estimates, [result for result, _ in scored])]
+    names = [path.name for path in estimates]
+    results = [result for result, _ in scored]
+    lines = [results[0].protocol, comparison_table(names, results)]
     for path, (result, likely) in zip(estimates, scored, strict=True):
         lines += [f"{path.name}: {line}" for line in remarks(result, likely)]
     facts = [{"file": str(path)} | fact for path, fact in zip(estimates, facts, strict=True)]
     present(facts, *lines, *written)
-
-
-STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
-"""Statistics of an error, in the order of the columns."""
-_METRIC = re.compile(rf"(?P<error>.+)_(?P<statistic>{'|'.join(STATISTICS)})_(?P<unit>[a-z]+?)2?$")
-"""Name of a statistic of an error; a sum of squares has the unit squared."""
-
-
-def statistics_table(result: Evaluation) -> str:
-    """Errors as rows, their statistics as columns; then the metrics that are single numbers."""
-    rows: dict[tuple[str, str], dict[str, float]] = {}
-    single = []
-    for name, value in result.metrics.items():
-        # `ate_rmse_m` is the statistic `rmse` of the error `ate` in the unit `m`
-        match = _METRIC.match(name)
-        if match is None or name.startswith("static_camera"):
-            single.append((name, value))
-        else:
-            rows.setdefault((match["error"], match["unit"]), {})[match["statistic"]] = value
-    cells = [
-        [f"{error} ({unit})", *[values.get(statistic) for statistic in STATISTICS]]
-        for (error, unit), values in rows.items()
-    ]
-    lines = [table(("error", *STATISTICS), cells)]
-    lines += [f"{name}  {cell_text(value)}" for name, value in single]
-    return "\n".join(lines)
-
-
-def comparison_table(paths: list[Path], results: list[Evaluation]) -> str:
-    """A row for each of several estimates: its absolute errors, and its relative ones by their rmse."""
-    shown = [
-        name
-        for name in results[0].metrics
-        if name.endswith(("_rmse_m", "_rmse_deg", "ate_median_m", "ate_max_m"))
-    ]
-    rows = [
-        [path.name, result.n_pairs, *[result.metrics.get(name) for name in shown]]
-        for path, result in zip(paths, results, strict=True)
-    ]
-    return table(("file", "poses", *shown), rows)
 
 
 def draw(
@@ -219,8 +181,11 @@ def compare(
     loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
     scores = compare_protocols(loaded, truth)
     lines = remarks(*scored_with_hints(loaded, truth, "tum-rgbd/v1"))
-    columns = ["metric", "protocol", "rmse (m)", "pairs", "note"]
-    rows = [[score.metric, score.label, score.rmse_m, score.pairs, score.note] for score in scores]
+    columns = ["metric", "protocol", "rmse (mm)", "pairs", "note"]
+    rows = []
+    for score in scores:
+        rmse_mm = None if score.rmse_m is None else 1000 * score.rmse_m
+        rows.append([score.metric, score.label, rmse_mm, score.pairs, score.note])
     if published is None:
         present(scores, table(columns, rows), *lines)
         return
@@ -230,8 +195,8 @@ def compare(
     defined = [score for score in scores if score.rmse_m is not None]
     nearest = min(defined, key=lambda score: abs((score.rmse_m or 0.0) - float(published)))
     if not any(marks):
-        closest = f"the nearest is {nearest.label}, {nearest.rmse_m:.6f}"
-        lines.append(f"No row agrees with {published}; {closest}.")
+        closest = f"the nearest is {nearest.label}, {nearest.rmse_m:.6f} m"
+        lines.append(f"No row agrees with {published} m; {closest}.")
     columns.insert(2, "published")
     for row, mark in zip(rows, marks, strict=True):
         row.insert(2, "agrees" if mark else "")

@@ -159,7 +159,7 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
 
 
 def _covariance_blemishes(value: object) -> Iterator[Fault]:
-    """What is wrong with a motion covariance; runs state it, and score the others."""
+    """Faults of a motion covariance; runs state it, and score the others."""
     expected = "expected a 6x6 covariance of (translation in m, rotation in rad)"
     matrix = as_covariance(value)
     if not np.isfinite(matrix).all():

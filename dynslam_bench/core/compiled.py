@@ -1,4 +1,4 @@
-"""How kernels are compiled: functions in numba's subset of Python that become machine code at their first call."""
+"""Compilation of kernels: functions in numba's subset of Python that become machine code at their first call."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, cast

@@ -34,7 +34,7 @@ _GO_ON = "run the same command again, it goes on from there"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a fetch is.
+    """Progress of a fetch.
 
     Attributes:
         stage: What is being done.

@@ -17,7 +17,7 @@ STAGES_VARIABLE = "DYNSLAM_BENCH_CACHE"
 WEIGHTS_VARIABLE = "DYNSLAM_BENCH_WEIGHTS"
 """Names the folder of downloaded weights."""
 KERNEL_SUFFIX = ".kernel"
-"""How the names of compiled kernels end."""
+"""Ending of the names of compiled kernels."""
 
 
 def user_cache() -> Path:

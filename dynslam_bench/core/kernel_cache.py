@@ -106,7 +106,7 @@ def load_kernels() -> None:
 def kernel_file(
     kernel: Foreign, arguments: tuple[Foreign, ...], return_type: Foreign, flags: Foreign
 ) -> Path | None:
-    """Where a kernel lies that is compiled for some types; None if it is compiled in memory only.
+    """Path of a kernel that is compiled for some types; None if it is compiled in memory only.
 
     Args:
         kernel: One of `KERNELS`.
@@ -125,7 +125,7 @@ def kernel_file(
 
 
 def _name_prefix(kernel: Foreign) -> str:
-    """How the names of a kernel's files begin; empty if it is compiled in memory only."""
+    """Beginning of the names of a kernel's files; empty if it is compiled in memory only."""
     function = kernel.py_func
     name = f"{function.__module__}.{function.__qualname__}".removeprefix(f"{PACKAGE}.")
     readable = re.sub("[^A-Za-z0-9_.]", "", name)[-100:]

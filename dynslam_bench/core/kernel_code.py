@@ -40,7 +40,7 @@ NO_CODE = (
     "SHOW_HELP",
     "THREADING",
 )
-"""How those settings of numba begin that do not change what is compiled."""
+"""Beginning of those settings of numba that do not change what is compiled."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
 """Types of values that their `repr` tells completely."""
 
@@ -145,6 +145,7 @@ def _with_inner_code(code: CodeType) -> Iterator[CodeType]:
 
 
 def _code_words(code: CodeType, docstring: str | None) -> Iterator[str]:
+    """Words for everything in a function's byte code that decides what it computes, without line numbers."""
     yield code.co_code.hex()
     yield getattr(code, "co_exceptiontable", b"").hex()  # Python 3.10 has none
     yield repr((code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags))

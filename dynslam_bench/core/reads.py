@@ -21,7 +21,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from dynslam_bench.core.fingerprint import path_digest
-from dynslam_bench.core.programs import folders_of
+from dynslam_bench.core.programs import folders_of, is_counted
 from dynslam_bench.core.records import Record, digest
 
 ABSENT = ""
@@ -29,23 +29,23 @@ ABSENT = ""
 UNREADABLE = "unreadable"
 """Stands for what is there and cannot be read."""
 INSTALLED = "installed"
-"""Where a module was found that lies beside its distribution's metadata; the distribution tells its content."""
+"""Place of a module that lies beside its distribution's metadata; the distribution tells its content."""
 SEARCH_PATHS = ("PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD")
 """Environment variables whose folders count in their order (`Reads.search`)."""
 COMMAND = "command "
 """Begins, in `Reads.search`, the name of a command that was looked up on ``PATH``."""
+ALL_VARIABLES = "all names"
+"""Stands, in `Reads.environment`, for the names of all variables that are set; it comes after each ``$NAME``."""
 BYTE_CODE_FOLDER = "__pycache__"
 """Python writes it beside every source that it imports; its content tells nothing that the sources do not."""
 _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not kept: a change within the same tick of the clock would not show."""
 _METADATA = (".dist-info", ".egg-info")
-"""How the names of folders end that hold a distribution's metadata."""
+"""Endings of the names of folders that hold a distribution's metadata."""
 _NOT_CONTENT = ("..", ".pyc", ".dist-info")
 """Lines of a distribution's RECORD with these differ between installations of the same files."""
-_FIRST_PART = re.compile("^[^/,\\n]+", re.MULTILINE)
-"""The first folder, or the file itself, of each line of a RECORD."""
 _SUFFIXES = tuple(importlib.machinery.all_suffixes())
-"""How files end that Python imports as modules."""
+"""Endings of files that Python imports as modules."""
 
 
 def _sorted(entries: dict[str, str]) -> dict[str, str]:
@@ -67,7 +67,9 @@ class Reads(Record):
         folders: Digest of the names in each folder that was listed.
         links: Where each file or folder lies that was reached through symbolic links.
         environment: Digest of the value of each environment variable, by ``$NAME``. Values may be
-            secrets: eight digits show that one has changed and are too few to find it.
+            secrets: eight digits show that one has changed and are too few to find it. Where all
+            variables were listed, the digest of their names, too, by `ALL_VARIABLES`: code that
+            looks for names with a beginning sees one that is set later.
         search: The paths on which libraries and modules are searched; what each command was found
             to be.
         modules: Where each module that was asked for was found, by its top-level name.
@@ -218,6 +220,11 @@ def value_digest(value: str | None) -> str:
     return ABSENT if value is None else digest(value, 8)
 
 
+def variables_now(environment: Mapping[str, str]) -> str:
+    """Digest of the names of the variables that are set, of those whose values count."""
+    return digest_of_names(sorted(filter(is_counted, environment)))
+
+
 def search_now(name: str, environment: Mapping[str, str], base_folders: BaseFolders) -> str:
     """The folders of a search path, or the file that a command runs.
 
@@ -346,7 +353,7 @@ class ImportPath:
         return namespace
 
     def place(self, top: str, base_folders: BaseFolders) -> str:
-        """Where a top-level module is found: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
+        """Place of a top-level module: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
         module_file = self.find(top)
         if module_file:
             neighbours = self._names[os.path.dirname(module_file)]
@@ -387,7 +394,10 @@ def _top_level_names(metadata: str) -> set[str]:
 
 def _first_parts(record: Path) -> set[str]:
     """The names of the modules that lie where the files of a RECORD begin."""
-    parts = set(_FIRST_PART.findall(record.read_text(encoding="utf-8", errors="replace")))
+    # the first folder, or the file itself, of each line
+    lines = record.read_text(encoding="utf-8", errors="replace").split("\n")
+    parts = {line.partition("/")[0] for line in lines}
+    parts = {part.partition(",")[0] for part in parts}
     modules = {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)}
     return modules - {"", BYTE_CODE_FOLDER}
 
@@ -439,6 +449,8 @@ class Verifier:
         match section:
             case "search":
                 return search_now(name, self._environment, base_folders)
+            case "environment" if name == ALL_VARIABLES:
+                return variables_now(self._environment)
             case "environment":
                 return value_digest(self._environment.get(name.removeprefix("$")))
             case "modules":
@@ -473,6 +485,8 @@ def _in_words(section: str, name: str, before: str) -> str:
             return f"the place of the {name}"
         case "search":
             return name
+        case "environment" if name == ALL_VARIABLES:
+            return "the list of environment variables"
         case "environment":
             return f"the environment variable {name.removeprefix('$')}"
         case "modules":

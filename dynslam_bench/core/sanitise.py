@@ -90,7 +90,7 @@ _HINT = re.compile(
 _NAME = (
     r"(?:password|passwd|passphrase|pwd|token|secret|credentials?|(?:api|access|private)[-_]?key)"
 )
-"""How the name of a secret ends."""
+"""Endings of the names of secrets."""
 _TEXT = r"(?:[^\"\\]|\\.)"
 """A character of a text in JSON."""
 _BARE = r"(?:[^\s\"'\\&;#]|\\[^\"'])+"

@@ -89,7 +89,7 @@ class SimdType(types.Type):
 
 @register_model(SimdType)
 class _SimdModel(models.PrimitiveModel):
-    """How numba holds a vector: as LLVM's value of its type."""
+    """Numba's model of a vector: LLVM's value of its type."""
 
     def __init__(self, manager: Code, kind: Code) -> None:
         super().__init__(manager, kind, kind.vector)

@@ -141,7 +141,7 @@ class StageCache:
         return 0 if total <= self.max_bytes else self._shrink(_SHRINK_TO * self.max_bytes)
 
     def info(self) -> dict[str, Any]:
-        """How full the cache is: ``folder``, ``max_bytes``, ``bytes_by_stage`` and ``entries_by_stage``."""
+        """Filling of the cache: ``folder``, ``max_bytes``, ``bytes_by_stage`` and ``entries_by_stage``."""
         sizes = Counter[str]()
         counts = Counter[str]()
         for _, path, size in sorted(self._entries(), key=itemgetter(1)):
@@ -171,7 +171,7 @@ class StageCache:
         return freed
 
     def path(self, stage: str, key: str, suffix: str = ".npz") -> Path:
-        """Where an entry lies.
+        """Path of an entry.
 
         `get` and `put` use ``.npz``. Other modules write ``.npy``, which count and are deleted as all
         entries are.

@@ -19,7 +19,7 @@ else:
 _PREFIXED = re.compile(r"[a-z][a-z0-9_-]*:")
 """Begins an id that names a file behind a colon: ``onnx:/home/me/net.onnx``."""
 _NETWORK_SUFFIX = re.compile(r"\.(?:onnx|pt|pth|tflite)$")
-"""How files of networks end."""
+"""Endings of files of networks."""
 
 
 def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[str, Any]:

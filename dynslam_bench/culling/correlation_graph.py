@@ -139,7 +139,16 @@ class CorrelationFilter(BaseFilter[CorrelationSettings]):
     def _observe(
         self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
     ) -> NDArray[np.float64]:
-        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
+        """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth.
+
+        Args:
+            xy: Undistorted pixels ``[N, 2]``.
+            raw: Raw pixels ``[N, 2]``, as the lens distorts them.
+            z: Depths there ``[N]``, metres, 0 or NaN missing.
+            depth: The whole depth image ``[H, W]``, whose scatter around each pixel gives the
+                variance.
+            camera: Intrinsics.
+        """
         points = np.full((len(xy), 12), np.nan)
         valid = np.isfinite(z) & (z > 0)
         pixels = np.asarray(xy[valid], np.float64)

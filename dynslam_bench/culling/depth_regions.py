@@ -28,10 +28,12 @@ class DepthRansacFilter(ObjectFilter[DepthRansacSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Find the person among the features of every box; features without depth are dropped too."""
+        # the dynamic boxes, and the features in each
         keep = np.ones(len(frame.xy), dtype=bool)
         boxes = dynamic_boxes(frame, self.segmentation)
         member = in_boxes(frame.keypoints.xy, boxes)
         for number, in_box in enumerate(member):
+            # the largest set of similar depth is the person; RANSAC draws the same in every run
             measured = np.flatnonzero(in_box & (frame.z > 0))
             rng = stream(state.seed, self.name, number)
             person = person_set(frame.z[measured], self.settings, rng)
@@ -97,11 +99,13 @@ class BoxDepthFilter(ObjectFilter[BoxDepthSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Segment the person in every box and drop the features on them."""
+        # a person's mask in each box; those that are ignored have none
         depth = np.nan_to_num(frame.depth)
         boxes = dynamic_boxes(frame, self.segmentation)
         segmented = [self._segment(box, depth) for box in boxes]
         people = [mask for mask in segmented if mask is not None]
         union = np.logical_or.reduce([np.zeros(depth.shape, bool), *people])
+        # the features on the people, with a border, are dropped
         mask = dilate(union, at_width(self.settings.dilation_px, depth.shape[1]))
         keep = ~inside(mask, frame.keypoints.xy)
         ignored = len(boxes) - len(people)
@@ -139,7 +143,14 @@ class BoxDepthFilter(ObjectFilter[BoxDepthSettings]):
 def _window(
     box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple[int, ...]
 ) -> tuple[slice, slice]:
-    """Rows and columns of a box that is grown on all sides, within an image of a shape."""
+    """Rows and columns of a box that is grown on all sides, within an image of a shape.
+
+    Args:
+        box: Corners x0, y0, x1, y1 in pixels.
+        grow_x: Pixels added on the left and on the right; negative to shrink.
+        grow_y: Pixels added above and below.
+        shape: Height and width of the image.
+    """
     x0, y0, x1, y1 = box.astype(np.float64)
     low = np.clip((y0 - grow_y, x0 - grow_x), 0, shape).astype(int)
     high = np.clip(np.ceil((y1 + grow_y, x1 + grow_x)), 0, shape).astype(int)

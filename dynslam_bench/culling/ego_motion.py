@@ -99,6 +99,7 @@ def static_share(
     cell, cells = cell_index(state.previous.keypoints.xy, side, shape)
     count = np.bincount(cell, minlength=np.prod(cells))
     kept = np.bincount(cell, weights=state.previous_keep, minlength=np.prod(cells))
+    # the share at the cell of each point
     share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
     return np.asarray(share[cell_index(previous_xy, side, shape)[0]])
 
@@ -106,7 +107,7 @@ def static_share(
 def rigid_flow(
     frame: FrameBundle, state: FilterState, rows: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where points would have been in the previous frame if only the camera moved.
+    """Positions that points would have had in the previous frame if only the camera moved.
 
     Args:
         frame: The current frame.
@@ -119,6 +120,7 @@ def rigid_flow(
     """
     assert state.T_world_prev is not None
     assert state.T_world_pred is not None
+    # the points in this camera's frame, then in the previous one's
     points = state.camera.unproject(frame.xy[rows], frame.z[rows])
     moved = se3.transform(se3.inverse(state.T_world_prev) @ state.T_world_pred, points)
     return moved, state.camera.project(moved)
@@ -301,7 +303,14 @@ def _align(
 
 @kernel
 def _squared_errors(pose: Array, points: Array, pixels: Array, camera: Intrinsics) -> Array:
-    """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
+    """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera.
+
+    Args:
+        pose: Transform ``[4, 4]`` into the camera frame.
+        points: ``[N, 3]``, metres.
+        pixels: Undistorted pixels ``[N, 2]`` that they are compared with.
+        camera: Intrinsics.
+    """
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
         x, y, z = transform_point(pose, points[i])
@@ -326,6 +335,7 @@ def _linearise(
 
     `shutter` ``[N]`` is added to the squared scale of the Geman-McClure kernel, squared pixels.
     """
+    # sums over all points before the camera
     fx = camera.fx
     fy = camera.fy
     hessian = np.zeros((6, 6))

@@ -63,6 +63,7 @@ def fundamental_matrix(
     Returns:
         F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate).
     """
+    # all matches at first, then those that agree with the F before
     agree = np.ones(len(x1), dtype=bool)
     for refit in range(refits + 1):
         if np.count_nonzero(agree) < min_matches:
@@ -82,6 +83,7 @@ def fundamental_matrix(
 
 def epipolar_distance(matrix: NDArray[np.float64], x1: Points, x2: Points) -> Points:
     """Distances ``[N]`` in pixels of x2 to the epipolar line of x1 (Eq. 25, with the root that the text lost)."""
+    # the line F x1 of each match: a x + b y + c = 0
     lines = np.column_stack([x1, np.ones(len(x1))]) @ matrix.T
     signed = (lines[:, :2] * x2).sum(axis=1) + lines[:, 2]
     return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
@@ -133,6 +135,7 @@ def matches_by_flow(
     flow = state.flow
     if flow is None or state.previous is None:
         return None
+    # the keypoints that are tested
     if unmatched is None:
         tested = flow.valid
     elif unmatched == "judge":
@@ -295,6 +298,7 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
     Returns:
         bool ``[N]`` keep, and the number of moving objects.
     """
+    # object by object: the tested points on it vote
     keep = np.ones(len(frame.xy), dtype=bool)
     moving = 0
     if frame.instances is None:
@@ -323,6 +327,7 @@ class BoxEpipolarFilter(ObjectFilter[BoxEpipolarSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
+        # matches by flow, and the features whose flow failed
         settings = self.settings
         keep = np.ones(len(frame.xy), dtype=bool)
         matches = matches_by_flow(frame, state, settings.unmatched)
@@ -353,6 +358,7 @@ class BoxEpipolarFilter(ObjectFilter[BoxEpipolarSettings]):
             "boxes": len(boxes),
             "f_asked": 1,
         }
+        # distances of all tested matches from their epipolar lines
         distance = matches.distances(fitted, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)
@@ -386,6 +392,7 @@ class ClassRuleFilter(ObjectFilter[ClassRuleSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop by class first, then test movable objects by geometry."""
+        # matches by flow; without any object everything is kept
         settings = self.settings
         xy = frame.keypoints.xy
         keep = np.ones(len(xy), dtype=bool)
@@ -427,6 +434,7 @@ class ClassRuleFilter(ObjectFilter[ClassRuleSettings]):
             drop = on_object & failed
             if voters.any() and off_line[voters].mean() >= settings.vote_share:
                 stats["moving_objects"] += 1
+                # its points at its own depth: the mask covers some background, too
                 depth = frame.depth[mask]
                 depth = depth[np.isfinite(depth) & (depth > 0)]
                 if len(depth):
@@ -554,7 +562,14 @@ def _patch_difference(
     xy1: NDArray[np.float32],
     xy2: NDArray[np.float32],
 ) -> NDArray[np.int64]:
-    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
+    """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``.
+
+    Args:
+        first: uint8 ``[H, W]``, grey levels.
+        second: uint8 ``[H, W]``, grey levels of the other image.
+        xy1: Pixels ``[N, 2]`` of the first image.
+        xy2: Pixels ``[N, 2]`` of the second image.
+    """
     difference = _patches(first, xy1) - _patches(second, xy2)
     return np.asarray(np.abs(difference).sum(axis=0))
 

@@ -89,6 +89,7 @@ class MultiViewFilter(BaseFilter[MultiViewSettings]):
         self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]
     ) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
+        # motion from each keyframe to the frame
         relative = np.stack([se3.inverse(view.T_world_cam) @ pose for view in views])
         distance = np.linalg.norm(relative[:, :3, 3], axis=1)
         angle = se3.rotation_angle(relative)
@@ -103,7 +104,14 @@ class MultiViewFilter(BaseFilter[MultiViewSettings]):
         pose: NDArray[np.float64],
         camera: Camera,
     ) -> NDArray[np.int64]:
-        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
+        """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference.
+
+        Args:
+            views: Keyframes whose features are projected into the frame.
+            depth: float32 ``[H, W]`` metres, 0 missing.
+            pose: Camera-to-world pose ``[4, 4]`` of the frame.
+            camera: Intrinsics and distortion.
+        """
         # the keyframes' points in the world, and the rays to them from both cameras
         world = []
         from_view = []
@@ -145,6 +153,7 @@ def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArra
 
     Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
+    # the windows' corners, within the image, and their numbers of pixels
     height, width = depth.shape
     margin = window_margin(depth)
     x0, y0 = (xy - margin).clip(0).T
@@ -156,6 +165,7 @@ def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArra
         total = table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
         return np.asarray(np.asarray(total, dtype=np.float64) / n)
 
+    # variance as the mean square less the squared mean
     sums, squared_sums = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     return np.asarray(window_means(squared_sums) - np.square(window_means(sums)))
 
@@ -246,9 +256,12 @@ def grow(
     flat = depth.ravel()
     out = mask.ravel()
     for k in range(len(seeds)):
+        # a region for each seed that has a depth and lies in no earlier region
         start = seeds[k, 1] * width + seeds[k, 0]
         if out[start] or not flat[start] > 0:
             continue
+
+        # it begins with the seed alone, without candidates
         head[:] = -1
         mean = 0.0
         size = 0

@@ -12,7 +12,7 @@ from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import feature_scale
 
 ORIGIN = EDGE - 3
-"""Where the extractor's cells begin, in pixels of a level."""
+"""Beginning of the extractor's cells, in pixels of a level."""
 
 
 class ReseedingFilter(BaseFilter[ReseedingSettings]):

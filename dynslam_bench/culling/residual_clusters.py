@@ -39,6 +39,7 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Cluster the image, warp it, classify the clusters."""
+        # the first frame, and a lost camera, have nothing to compare with
         keep = np.ones(len(frame.xy), dtype=bool)
         if state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
             return self.verdict(keep)
@@ -81,7 +82,14 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
         xy: NDArray[np.float64],
         z: NDArray[np.floating],
     ) -> NDArray[np.float64]:
-        """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it."""
+        """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it.
+
+        Args:
+            frame: The current frame.
+            state: With the previous frame, its pose and the predicted one.
+            xy: Raw pixels of the samples.
+            z: Their depths ``[N]``, metres.
+        """
         assert state.previous is not None
         assert state.T_world_prev is not None
         assert state.T_world_pred is not None
@@ -113,8 +121,10 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
 
         Places are in units of `CLUSTER_PX`.
         """
+        # place and depth in comparable units
         features = np.column_stack([places, np.asarray(z) / CLUSTER_M]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
+        # each sample begins with the nearest of the random centres
         centres = stream(seed, self.name).choice(
             len(features), self.settings.clusters, replace=False
         )
@@ -129,6 +139,7 @@ class ResidualFilter(ObjectFilter[ResidualSettings]):
         self, residual: NDArray[np.float64], label: NDArray[np.intp], people: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Flags ``[K]`` of moving clusters: posterior of the two-component mixture above the threshold."""
+        # without any residual nothing is known to move
         count = self.settings.clusters
         measured = np.isfinite(residual)
         if not measured.any():

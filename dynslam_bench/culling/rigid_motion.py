@@ -135,8 +135,8 @@ def nearby_mean(
     Args:
         xy: Raw pixels of the points ``[N, 2]``.
         z: Depths of the points ``[N]``, metres, 0 missing.
-        values: ``[N, K]``.
-        at: Raw pixels ``[M, 2]``.
+        values: ``[N, K]``, whose means are taken.
+        at: Raw pixels ``[M, 2]`` around which they are taken.
         at_z: Depths there ``[M]``, metres; where 0, points of any depth count.
         nearby_px: Largest distance along either axis, pixels.
 
@@ -162,8 +162,20 @@ def _fill_nearby_mean(
     nearby_px: float,
     means: Array,
 ) -> None:
-    """Add the means ``[M, K]`` of points that are sorted by rows; `first` ``[M]`` is the first that may be near."""
+    """Add the means ``[M, K]`` of the values of nearby points.
+
+    Args:
+        xy: Raw pixels ``[N, 2]``, sorted by rows.
+        z: Depths ``[N]``, metres, 0 missing.
+        values: ``[N, K]``, whose means are taken.
+        at: Raw pixels ``[M, 2]`` around which they are taken.
+        at_z: Depths there ``[M]``, metres, 0 missing.
+        first: For each of these ``[M]`` the first point that may be near.
+        nearby_px: Largest distance along either axis, pixels.
+        means: Filled; zeros before.
+    """
     for i in range(len(at)):
+        # what counts as near: columns to either side, a last row, a share of the depth
         column = at[i, 0]
         depth = at_z[i]
         tolerance = SIMILAR_DEPTH * at_z[i]
@@ -179,6 +191,7 @@ def _fill_nearby_mean(
                 for j in range(means.shape[1]):
                     means[i, j] += values[k, j]
                 count += 1
+        # from sums to means
         if count > 0:
             for j in range(means.shape[1]):
                 means[i, j] /= count

@@ -42,7 +42,7 @@ class GuardSettings(Settings):
     )
 
     def needed(self, total: int) -> int:
-        """How many of `total` keypoints culling must leave."""
+        """Number of `total` keypoints that culling must leave."""
         return min(total, max(self.min_features, math.ceil(self.min_fraction * total)))
 
 

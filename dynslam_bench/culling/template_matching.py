@@ -70,10 +70,12 @@ class TemplateFilter(ObjectFilter[TemplateSettings]):
 
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
+    # patches that lie in the image as a whole
     half = size // 2
     height, width = gray.shape
     centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
     fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
+    # rows and columns of each patch; patches that do not fit are moved inside, and erased below
     span = np.arange(-half, half + 1)
     columns = centre[:, 0, None, None].clip(half, width - half - 1) + span[None, None, :]
     rows = centre[:, 1, None, None].clip(half, height - half - 1) + span[None, :, None]
@@ -84,6 +86,7 @@ def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDAr
 
 def zncc(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zero-mean normalised cross-correlation ``[N]`` of patches ``[N, M]``; NaN where a patch is flat or missing."""
+    # the patches less their means
     a = first - first.mean(axis=1, keepdims=True)
     b = second - second.mean(axis=1, keepdims=True)
     norm = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from dynslam_bench.core import EvaluationError
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation.protocol import Alignment
 from dynslam_bench.geometry import Array, se3
 
@@ -53,7 +54,7 @@ class Similarity:
         positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
         along, *across = np.linalg.svd(positions, compute_uv=False) / np.sqrt(len(positions))
         return [
-            f"the path (spread {along:.3f} m along, {across[0]:.3f} and {across[1]:.3f} m across) hardly determines "
+            f"the path (spread {mm(along)} mm along, {mm(across[0])} and {mm(across[1])} mm across) hardly determines "
             f"the alignment's rotation with such errors: +-{self.uncertainty_deg:.0f} degrees; the absolute rotational "
             "error (ape_rot) is unreliable, the translational and the relative ones are not affected"
         ]
@@ -142,13 +143,18 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
 
 
 _ROUNDING = 8 * float(np.finfo(np.float64).eps)
-"""How much of a coordinate the rounding of differences may make up."""
+"""Share of a coordinate that the rounding of differences may make up."""
 _ON_A_LINE = 1e-12
 """Share of the first singular value below which the second one says that the positions lie on a line."""
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:
-    """Rotation that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it."""
+    """Rotation R ``[3, 3]`` that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it.
+
+    Args:
+        covariance: C ``[3, 3]``, of the true positions with the estimated ones, without units.
+        orientation: Mean of true times inverse estimated orientations ``[3, 3]``.
+    """
     # where the positions lie on a line or in a point, the orientations decide what is left open
     u, singular, vt = np.linalg.svd(covariance)
     degenerate = bool(singular[1] <= _ON_A_LINE * singular[0])
@@ -162,7 +168,14 @@ def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, flo
 
 
 def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
-    """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it."""
+    """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it.
+
+    Args:
+        covariance: C ``[3, 3]``, of the true positions with the estimated ones, without units.
+        orientation: Mean of true times inverse estimated orientations ``[3, 3]``, which decides
+            where C does not.
+    """
+    # tr(R^T C) = cos(angle) (C_xx + C_yy) + sin(angle) (C_yx - C_xy) + C_zz
     degenerate = (
         np.hypot(covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]) < 1e-15
     )

@@ -136,6 +136,7 @@ def static_camera_metrics(comparison: Comparison) -> dict[str, float]:
     truth = comparison.ground_truth
     protocol = comparison.protocol
     stamps = comparison.input_timestamps
+    # without the frames' stamps, or where the protocol takes a part of them: at the associated truth
     if stamps is None or protocol.thins:
         truth = truth.select(np.unique(comparison.truth_index))
         stamps = None

@@ -1,4 +1,4 @@
-"""How much the protocol alone changes the numbers of one trajectory."""
+"""Comparison of protocols: how much the protocol alone changes the numbers of one trajectory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -110,7 +110,7 @@ ABSOLUTE = (
 RELATIVE = (
     ("TUM, 1 frame, fixed delta", _variant(_TUM, "tum-rgbd/1f", RPESpec(delta=1, unit="f"))),
     ("TUM, 1 s, fixed delta", _variant(_TUM, "tum-rgbd/1s", RPESpec(delta=1, unit="s"))),
-    ("TUM, 1 s, as a rate (m/s)", PROTOCOLS["tum-rgbd/v1-rate"]),
+    ("TUM, 1 s, as a rate (mm/s)", PROTOCOLS["tum-rgbd/v1-rate"]),
     ("MonST3R (90 frames), 1 frame", PROTOCOLS["tum-dynamics-90/v1"]),
     ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
     ("evo_rpe, 1 frame", _EVO),

@@ -139,6 +139,7 @@ LARGEST_M = 1e150
 
 
 def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
+    """Refuse a trajectory with a pose farther away than `LARGEST_M`."""
     sizes = np.abs(trajectory.positions).max(axis=1, initial=0.0)
     if len(sizes) and sizes.max() > LARGEST_M:
         at = int(sizes.argmax())
@@ -239,7 +240,7 @@ def match(
 
 
 def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
-    """How the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, may be put on one clock."""
+    """Advice on putting the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, on one clock."""
     own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
     # frame numbers on one side
     if are_frame_numbers(own) != are_frame_numbers(true):
@@ -292,6 +293,7 @@ def nearest_match(
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
+    """Count the associated poses, and the others by the reason why they have no partner; stamps in seconds."""
     # why a pose has no partner: beyond the ends, in a hole, or another was nearer
     unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)
@@ -386,6 +388,12 @@ def apply_policy(
 ) -> tuple[Trajectory, NDArray[np.bool_] | None]:
     """The estimate with its lost frames held or left out, as the protocol has it.
 
+    Args:
+        estimate: Camera-to-world poses as the tracker gave them.
+        protocol: Its `lost_frames` policy is applied.
+        input_timestamps: Stamps of all input frames, seconds; None if they are not known.
+        diagnostics: Gains a line on what was held or left out.
+
     Returns:
         The estimate, and which input frames were tracked ``[N]``; None where the input frames are
         not known.
@@ -416,6 +424,35 @@ def apply_policy(
 
 STAMP_TOLERANCE = 1e-3
 """Seconds within which two stamps name the same input frame (trajectory files round to a microsecond or worse)."""
+
+
+LONGEST_STEP_S = 1.0
+"""Poses that are farther apart in time have a hole between them, unless the trajectory has keyframes alone."""
+LONGEST_STEP = 5.0
+"""The same in median steps of a trajectory, for one of keyframes."""
+
+
+def share_of_time(stamps: ArrayLike, true_stamps: ArrayLike) -> float:
+    """Share of the ground truth's time that a trajectory has poses for, 0 to 1; holes do not count.
+
+    It takes the place of the coverage where the input frames are not known. A ground truth that is
+    longer than the recording makes it smaller than the coverage.
+
+    Args:
+        stamps: Stamps of the poses in seconds, in order.
+        true_stamps: Stamps of the ground truth in seconds, in order.
+    """
+    poses = np.asarray(stamps, dtype=np.float64)
+    truth = np.asarray(true_stamps, dtype=np.float64)
+    whole_s = float(truth[-1] - truth[0])
+    if len(poses) < 2 or whole_s <= 0:
+        return 0.0
+
+    # steps between poses, as far as they lie within the truth's time
+    longest_s = max(LONGEST_STEP_S, LONGEST_STEP * float(np.median(np.diff(poses))))
+    is_step = np.diff(poses) <= longest_s
+    within_s = np.diff(np.clip(poses, truth[0], truth[-1]))
+    return min(1.0, float(within_s[is_step].sum()) / whole_s)
 
 
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:

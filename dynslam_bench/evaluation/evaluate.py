@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.ape import (
     absolute_errors,
@@ -19,6 +20,7 @@ from dynslam_bench.evaluation.comparison import (
     Comparison,
     apply_policy,
     compare,
+    share_of_time,
     truth_of_file,
 )
 from dynslam_bench.evaluation.plausibility import warnings_of
@@ -78,6 +80,8 @@ class Evaluation(Record):
         n_tracked: Input frames with a tracked pose; None where the input frames are not known.
         coverage: Share of the input frames with a tracked pose, 0 to 1; None where they are not
             known.
+        truth_share: Share of the ground truth's time that the estimate has poses for, 0 to 1, see
+            `share_of_time`; it tells what the coverage cannot where the input frames are not known.
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
         diagnostics: One line for each fact that the numbers depend on.
@@ -94,17 +98,21 @@ class Evaluation(Record):
     n_input: int | None = None
     n_tracked: int | None = None
     coverage: float | None = None
+    truth_share: float | None = None
     alignment: AlignmentRecord
     association: AssociationRecord
     diagnostics: list[str]
     warnings: list[str] = Field(default_factory=list)
 
     def summary(self) -> str:
-        """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
-        share = self.coverage
-        covered = "" if share is None else f", {100 * share:.1f} % of {self.n_input} frames tracked"
+        """The ATE with what it depends on, e.g. ``ATE (rmse) 14.2 mm over 848 poses [tum-rgbd/v1 ...]``."""
+        covered = ""
+        if self.coverage is not None:
+            covered = f", {100 * self.coverage:.1f} % of {self.n_input} frames tracked"
+        elif self.truth_share is not None:
+            covered = f", {100 * self.truth_share:.1f} % of the truth's time"
         return (
-            f"ATE (rmse) {self.metrics['ate_rmse_m']:.4f} m over {self.n_pairs} poses{covered} "
+            f"ATE (rmse) {mm(self.metrics['ate_rmse_m'])} mm over {self.n_pairs} poses{covered} "
             f"[{self.protocol_id} {self.protocol_digest}]"
         )
 
@@ -129,7 +137,7 @@ def evaluate(
             lost-frame policy ``hold``.
         motion_covariances: What the tracker says of its errors, see `motion_uncertainty`; they are
             scored with poses in metres alone.
-        truth_noise: Of the true poses, for the covariances.
+        truth_noise: Noise of the true poses, for the covariances.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is
@@ -145,6 +153,7 @@ def evaluate(
     uncertainty = Uncertainty()
     if motion_covariances is not None and not protocol.finds_scale:
         uncertainty = motion_uncertainty(estimate, motion_covariances, ground_truth, truth_noise)
+    truth_share = share_of_time(estimate.timestamps, ground_truth.timestamps)
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     if protocol.finds_scale:
@@ -169,6 +178,7 @@ def evaluate(
         n_input=None if tracked is None else len(tracked),
         n_tracked=None if tracked is None else int(tracked.sum()),
         coverage=None if tracked is None else float(tracked.mean()),
+        truth_share=truth_share,
         alignment=AlignmentRecord(
             mode=protocol.alignment,
             rotation=similarity.rotation.tolist(),

@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.protocol import Protocol, get_protocol
 from dynslam_bench.geometry import Array, FileNotes, Trajectory, se3
@@ -150,7 +151,7 @@ def _several_recordings(
 
 
 def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float]:
-    """How late the truth has to be read for displacements to agree, and the share of them that then stays unexplained.
+    """Delay with which the truth has to be read for displacements to agree, and the share that then stays unexplained.
 
     Returns:
         Seconds to add to the stamps, 0 without clear evidence, and the share in [0, 1], at any
@@ -186,26 +187,32 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     # fine: a quarter of a step; the last one is no shift, for comparison
     fine = lag * step + np.linspace(-1, 1, 9) * step
     begin = stamps[0] + step * at
-    near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
-    now = float(near[-1])
-    near = near[:-1]
-    best = int(np.argmin(near))
+    unexplained = _unexplained(
+        moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window)
+    )
+    unshifted_share = float(unexplained[-1])
+    shares = unexplained[:-1]
+    best = int(np.argmin(shares))
     shift = float(fine[best])
-    left = float(near[best])
+    least_share = float(shares[best])
 
     # finer: the minimum of the parabola through the best and its neighbours
     if 0 < best < len(fine) - 1:
-        before = near[best - 1]
-        after = near[best + 1]
-        bend = before - 2 * left + after
-        if bend > 0:
-            shift += float(0.5 * (before - after) / bend * (fine[1] - fine[0]))
+        before = shares[best - 1]
+        after = shares[best + 1]
+        curvature = before - 2 * least_share + after
+        if curvature > 0:
+            shift += float(0.5 * (before - after) / curvature * (fine[1] - fine[0]))
 
     # clear: it explains the motion, and such a shift shows on a path of this shape
     shifted_self = _displacements(track, begin[None] + shift, window)
     visible = float(_unexplained(moved, shifted_self)[0])
-    clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
-    return (shift, left) if clear else (0.0, now)
+    clear = (
+        abs(shift) > SHORTEST_SHIFT_S
+        and least_share < min(MOSTLY, 0.55 * unshifted_share)
+        and visible > 0.3 * unshifted_share
+    )
+    return (shift, least_share) if clear else (0.0, unshifted_share)
 
 
 def _grid_places(track: Track, step: float) -> Array:
@@ -272,7 +279,7 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
         Hint(
             "time-shift",
             f"the stamps seem to be {abs(shift):.3f} s {'early' if shift > 0 else 'late'}: with {shift:+.3f} s on each "
-            f"the error falls from {error:.4f} to {undone:.4f} m (at its best scale); give the stamps of the images, "
+            f"the error falls from {mm(error)} to {mm(undone)} mm (at its best scale); give the stamps of the images, "
             "on the truth's clock",
             {"shift_s": shift, "error_m": error, "error_undone_m": undone},
         )
@@ -315,8 +322,8 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     return [
         Hint(
             "scale",
-            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {error:.4g} "
-            f"to {undone:.4g} m; {cure}",
+            f"the positions seem to have a wrong scale: with the factor {scale:.4g} the error falls from {mm(error)} "
+            f"to {mm(undone)} mm; {cure}",
             {"scale": scale, "error_m": error, "error_undone_m": undone},
         )
     ]
@@ -348,7 +355,11 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     accuracy = COPY_M if noise > NOISE_M else EXACT_M
     least = min(accuracy, COPY_SHARE * fits[0].extent_m)
     if error < least:
-        text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
+        # the scale is fitted: without that the error may be larger
+        text = (
+            f"with the scale fitted, the error of {mm(error)} mm is below what trackers reach: were the poses "
+            "read from the truth?"
+        )
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
 
     # the error jitters less than the truth does: the estimate has the same noise
@@ -359,8 +370,8 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     jitter = min(jitters)
     if jitter < 0.5 * noise and noise > NOISE_M:
         text = (
-            f"from frame to frame the error changes by {1000 * jitter:.3g} mm, less than the truth's own noise of "
-            f"{1000 * noise:.3g} mm: were the poses made from the truth?"
+            f"from frame to frame the error changes by {mm(jitter)} mm, less than the truth's own noise of "
+            f"{mm(noise)} mm: were the poses made from the truth?"
         )
         return [Hint("below-truth-noise", text, {"jitter_m": jitter, "truth_noise_m": noise})]
     return []
@@ -455,7 +466,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well positions can be aligned, from their moments: Umeyama 1991, Eq. 40-43.
+    """Fit of positions by alignments, from their moments: Umeyama 1991, Eq. 40-43.
 
     Attributes:
         scale: Scale of the Sim(3) alignment.
@@ -477,7 +488,7 @@ class Fit:
 
 
 def fit(poses: Array, truth: Array) -> Fit:
-    """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
+    """Fit of the positions of poses ``[N, 4, 4]`` to those of the true ones by alignments."""
     # positions about their means, their covariance and variances
     own = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     true = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
@@ -581,7 +592,14 @@ def _wrong_convention(
 def _in_axes_of_a_body(
     poses: Array, pairs: NDArray[np.intp], true: Array, true_poses: Array
 ) -> list[tuple[float, Convention, Array]]:
-    """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one."""
+    """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one.
+
+    Args:
+        poses: Estimated poses ``[N, 4, 4]``.
+        pairs: Pairs of poses ``[P, 2]`` whose motions are compared.
+        true: True motions ``[P, 4, 4]`` of these pairs.
+        true_poses: True poses ``[N, 4, 4]``.
+    """
     motions = se3.between(poses, pairs)
     as_turned, _ = _compare(motions, true, R_est_cam=_axes(motions, true))
     # of the conventions only the first two, in axes that are fitted
@@ -614,7 +632,7 @@ def _axes(motions: Array, true: Array) -> Array:
 
 
 def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tuple[float, float]:
-    """How far the motions are from the true ones, and how well they vary with them.
+    """Distance of the motions from the true ones, and how well they vary with them.
 
     Scales are left out. Of rotations and translations those count that are larger than noise.
 

@@ -63,11 +63,13 @@ class OnlineError:
     def __init__(self, ground_truth: Trajectory | None, max_dt: float = 0.02) -> None:
         self._truth = ground_truth if ground_truth is not None and len(ground_truth) else None
         self._max_dt = max_dt
-        # from the estimate's world to the truth's, and the last tracked pose in the latter
-        self._align: Array | None = None
+        # from the estimate's world to the truth's
+        self._T_truth_estimate: Array | None = None
+        # the last tracked pose in the truth's world, which is held while tracking is lost
         self._held: Array | None = None
-        # true pose of the frame before, if it has one; pose of the last tracked frame
+        # true pose of the frame before, if it has one
         self._previous_truth: Array | None = None
+        # pose of the last tracked frame in the estimate's world
         self._previous_pose: Array | None = None
         # last true pose of any frame, the path up to it, and the true motion since the last tracked pose
         self._last_truth: Array | None = None
@@ -94,10 +96,10 @@ class OnlineError:
         """
         # join estimate and truth at the first frame that has both
         truth = self.truth_at(timestamp)
-        if pose is not None and truth is not None and self._align is None:
-            self._align = truth @ se3.inverse(pose)
-        if pose is not None and self._align is not None:
-            self._held = self._align @ pose
+        if pose is not None and truth is not None and self._T_truth_estimate is None:
+            self._T_truth_estimate = truth @ se3.inverse(pose)
+        if pose is not None and self._T_truth_estimate is not None:
+            self._held = self._T_truth_estimate @ pose
         sample = None if truth is None else self._sample(truth, pose)
         self._previous_truth = truth
         if pose is not None:

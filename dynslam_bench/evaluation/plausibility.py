@@ -7,6 +7,7 @@ changes no number. Like a hint it is one line that begins with its id: ``frame-n
 
 import numpy as np
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation.comparison import Comparison
 from dynslam_bench.geometry import (
     Trajectory,
@@ -98,5 +99,5 @@ def _of_static_camera(comparison: Comparison, metrics: dict[str, float]) -> list
         return []
     share = f"{100 * error / static:.0f} %"
     return [
-        f"static-camera: the error of {error:.4g} m is {share} of a static camera's, {static:.4g} m"
+        f"static-camera: the error of {mm(error)} mm is {share} of a static camera's, {mm(static)} mm"
     ]

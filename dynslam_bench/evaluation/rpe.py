@@ -215,16 +215,20 @@ def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
     """`closest` of float64 arrays as bytes; all targets are bisected at once."""
     values = np.frombuffer(value_bytes)
     targets = np.frombuffer(target_bytes)
+    # an interval of indices for each target, and the closest value met so far
     low = np.zeros(len(targets), dtype=np.intp)
     best = np.zeros(len(targets), dtype=np.intp)
     high = np.full(len(targets), len(values), dtype=np.intp)
     distance = np.abs(values[0] - targets)
     while (active := low < high).any():
+        # the middle of each interval that is not empty
         middle = np.where(active, (low + high) // 2, 0)
         value = values[middle]
         better = active & ((np.abs(value - targets) < distance) | (value == targets))
         best = np.where(better, middle, best)
         distance = np.where(better, np.abs(value - targets), distance)
+
+        # go on in the half that holds the target; an interval with an equal value is done
         high = np.where(active & (value > targets), middle, high)
         low = np.where(
             active & (value < targets), middle + 1, np.where(value == targets, high, low)

@@ -1,4 +1,4 @@
-"""How well a tracker knows its own errors: NEES and 95 % coverage of the covariances of its motions.
+"""Quality of a tracker's knowledge of its own errors: NEES and 95 % coverage of the covariances of its motions.
 
 The error of a motion is the twist ``xi`` (translation in metres, rotation in radians) in
 ``T_true = T_estimated Exp(xi)``, a right perturbation. Its normalised estimation error squared,
@@ -25,7 +25,7 @@ DEGREES = 6
 CHI2_95 = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
 CHI2_MEDIAN = 5.348
-"""Its median."""
+"""Median of chi-square with six degrees of freedom."""
 SYMMETRY = 1e-5
 """Largest difference of a matrix of correlations from its transpose; files have six digits."""
 POSITIVE = 1e-9
@@ -38,7 +38,7 @@ LONGEST_GAP_S = 0.1
 LARGEST_NEES = 1e12
 """A larger NEES counts as this: means stay numbers, however small a variance is."""
 FAR_OFF = 100.0
-"""A mean NEES / 6 this far from 1, above or below, is stated with the factor that would mend it."""
+"""A mean NEES of translation or rotation over its three degrees this far from 1 is stated, with its factor."""
 UNITS = {
     "translation": {1e3: "millimetres", 1e2: "centimetres"},
     "rotation": {180 / np.pi: "degrees"},
@@ -110,9 +110,9 @@ def motion_uncertainty(
 
     Args:
         estimate: Camera-to-world poses as they were when their frames came, in metres.
-        covariances: Of the motions to some or all of these frames.
+        covariances: Covariances of the motions to some or all of these frames.
         truth: True camera-to-world poses; those at the frames' stamps are interpolated.
-        noise: Of the true poses.
+        noise: Noise of the true poses.
     """
     # the covariance of each motion between neighbouring poses; NaN where there is none
     matrices = _matrices_of(estimate, covariances)
@@ -121,7 +121,7 @@ def motion_uncertainty(
     if not is_valid.any():
         return Uncertainty(warnings=warnings)
 
-    # motions by estimate and truth, where all is known
+    # motions by estimate and truth, where there are both
     poses, has_truth = _interpolated(truth, estimate.timestamps)
     after = np.arange(1, len(estimate))
     after = after[is_valid & has_truth[1:] & has_truth[:-1]]
@@ -187,26 +187,33 @@ class _Motions:
 
     def doubts(self) -> list[str]:
         """One line where the covariances are far off, with the factor and the unit that it suggests."""
-        ratio = float(nees(self.errors, self.covariances).mean()) / DEGREES
-        if 1 / FAR_OFF <= ratio <= FAR_OFF:
-            return []
+        ratio = _mean_nees(self.errors, self.covariances) / DEGREES
         parts = []
         for name, part in (("translation", slice(0, 3)), ("rotation", slice(3, 6))):
-            of_part = nees(self.errors[:, part], self.covariances[:, part, part])
-            factor = float(np.sqrt(3 / max(of_part.mean(), np.finfo(float).tiny)))
-            unit = next(
-                (
-                    f", as in {unit}"
-                    for size, unit in UNITS[name].items()
-                    if size / UNIT_TOLERANCE <= factor <= size * UNIT_TOLERANCE
-                ),
-                "",
-            )
-            parts.append(f"standard deviations of {name} are {factor:.3g} x the errors{unit}")
+            of_part = _mean_nees(self.errors[:, part], self.covariances[:, part, part]) / 3
+            if not 1 / FAR_OFF <= of_part <= FAR_OFF:
+                factor = 1 / np.sqrt(max(of_part, np.finfo(float).tiny))
+                unit = _unit_of(factor, UNITS[name])
+                parts.append(f"standard deviations of {name} are {factor:.3g} x the errors{unit}")
+        if not parts:
+            return []
         return [
             f"the covariances do not fit the errors: NEES / 6 is {ratio:.3g} over one frame, 1 is right; "
             f"{'; '.join(parts)}; metres and radians are expected, translation first"
         ]
+
+
+def _unit_of(factor: float, units: dict[float, str]) -> str:
+    """The unit that would explain standard deviations so many times too large, in words; empty for none."""
+    for size, unit in units.items():
+        if size / UNIT_TOLERANCE <= factor <= size * UNIT_TOLERANCE:
+            return f", as in {unit}"
+    return ""
+
+
+def _mean_nees(errors: Array, covariances: Array) -> float:
+    """Mean NEES, none of them counting for more than `LARGEST_NEES`."""
+    return float(np.minimum(nees(errors, covariances), LARGEST_NEES).mean())
 
 
 def nees(errors: Array, covariances: Array) -> Array:
@@ -243,7 +250,7 @@ def _matrices_of(estimate: Trajectory, covariances: MotionCovariances) -> Array:
 
 
 def _validate(matrices: Array, given: int) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which covariances ``[M, 6, 6]`` can be used, ``[M]``, and a line for each kind of fault.
+    """Flags ``[M]`` of the covariances ``[M, 6, 6]`` that can be used, and a line for each kind of fault.
 
     Args:
         matrices: The covariances.
@@ -294,16 +301,16 @@ def _interpolated(truth: Trajectory, stamps: Array) -> tuple[Array, NDArray[np.b
         return poses, np.zeros(len(stamps), bool)
     after = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
     gaps = times[after] - times[after - 1]
-    known = (stamps >= times[0]) & (stamps <= times[-1]) & (gaps <= LONGEST_GAP_S)
+    has_pose = (stamps >= times[0]) & (stamps <= times[-1]) & (gaps <= LONGEST_GAP_S)
     # a stamp that has a true pose needs no neighbour
     nearest = np.where(stamps - times[after - 1] < times[after] - stamps, after - 1, after)
-    known |= np.abs(times[nearest] - stamps) <= 1e-6
+    has_pose |= np.abs(times[nearest] - stamps) <= 1e-6
 
     at = np.clip(stamps, times[0], times[-1])
     rotation = Slerp(times, Rotation.from_matrix(truth.T_world_cam[:, :3, :3]))(at).as_matrix()
     places = np.stack([np.interp(at, times, axis) for axis in truth.positions.T], axis=1)
-    poses[known] = se3.from_matrix(places, rotation)[known]
-    return poses, known
+    poses[has_pose] = se3.from_matrix(places, rotation)[has_pose]
+    return poses, has_pose
 
 
 def _pairs_over_a_second(

@@ -100,7 +100,7 @@ def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> PseudoMed
 
 @lru_cache(maxsize=1024)
 def _critical_rank_sum(count: int, tail: float) -> int:
-    """How many values of the signed-rank sum of `count` scenes have at most `tail` of probability at one end."""
+    """Number of values of the signed-rank sum of `count` scenes that have at most `tail` of probability at one end."""
     # Exact null distribution: rank r is added or not, each with probability one half.
     probabilities = np.ones(1)
     for rank in range(1, count + 1):

@@ -61,7 +61,17 @@ def _rotated_brief(
     px: NDArray[np.float32],
     py: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    """`rotated_brief` with the columns and rows of the 512 places, float32 ``[512]`` each."""
+    """`rotated_brief` with the columns and rows of the 512 places, float32 ``[512]`` each.
+
+    Args:
+        smoothed: uint8 ``[H, W]``.
+        xy: Integer-valued pixels ``[N, 2]``.
+        angle: Orientations ``[N]``, degrees.
+        px: Columns of the pattern's places from the keypoint, pixels; place k is compared with k +
+            256.
+        py: Their rows.
+    """
+    # the image as one row, and scratch arrays for one keypoint
     pixels = smoothed.reshape(-1)
     width = smoothed.shape[1]
     offsets = np.empty(512, np.int32)

@@ -20,6 +20,7 @@ from dynslam_bench.geometry import feature_scale
 
 def enlarged(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """An image ``[H, W]`` that features are extracted from: as it is, or enlarged if it is narrow."""
+    # wide enough already
     if feature_scale(gray.shape[1]) == 1:
         return gray
     return np.asarray(

@@ -90,7 +90,17 @@ def list_corners(
     maxima: NDArray[np.uint8],
     corners: NDArray[np.int64],
 ) -> int:
-    """Fill the scores of the corners of a flat image, 0 elsewhere, and the corners' indices; returns how many."""
+    """Fill the scores of the corners of a flat image, 0 elsewhere, and the corners' indices; returns how many.
+
+    Args:
+        pixels: uint8, flat, the image and what the last vector reads beyond it.
+        height: Rows of the image.
+        width: Columns of the image.
+        threshold: Least score of a corner.
+        circle: Offsets of the circle's pixels in the flat image.
+        maxima: uint8, flat, filled.
+        corners: int64, filled with indices of the flat image.
+    """
     scores = np.zeros(len(pixels), np.uint8)
     # scores of all rows but those near the upper and lower border
     first = EDGE * width

@@ -146,7 +146,14 @@ class CellGrid:
 def _sorted_into_cells(
     xy: NDArray[np.float64], cell: float, columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`CellGrid.start` and `CellGrid.order`."""
+    """`CellGrid.start` and `CellGrid.order`.
+
+    Args:
+        xy: Pixels ``[N, 2]``.
+        cell: Side of a cell, pixels.
+        columns: Cells in a row.
+        rows: Rows of cells.
+    """
     cells = np.empty(len(xy), np.int64)
     for i in range(len(xy)):
         # the cell of the point; the border cells take what lies outside
@@ -226,7 +233,14 @@ class _SearchTargets(NamedTuple):
 def _search(
     features: _SearchFeatures, targets: _SearchTargets, max_distance: int, ratio: float
 ) -> NDArray[np.int64]:
-    """Index of the feature that each target is matched to ``[M]``, -1 without; see `search_in_radius`."""
+    """Index of the feature that each target is matched to ``[M]``, -1 without; see `search_in_radius`.
+
+    Args:
+        features: Features to choose from.
+        targets: Where and with which descriptors they are looked for.
+        max_distance: Largest Hamming distance of a match.
+        ratio: Nearest over second nearest distance up to which a match is distinct.
+    """
     # short names for the loops
     cell = features.cell
     columns = features.columns

@@ -122,6 +122,7 @@ class OrbExtractor:
 
     def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
         """All corners of every level of the pyramid."""
+        # until a level is too small for a corner with its patch
         image = gray = np.ascontiguousarray(gray, dtype=np.uint8)
         levels: list[_Level] = []
         for number in range(self.settings.levels):
@@ -144,6 +145,7 @@ class OrbExtractor:
 
         A corner below the first threshold is taken only in a cell without a stronger one.
         """
+        # from the coarsest level to the finest
         quotas = level_quotas(self.settings.n_features, len(levels), self.settings.scale_factor)
         chosen: list[NDArray[np.int64]] = []
         missing = 0
@@ -161,8 +163,10 @@ class OrbExtractor:
 
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
         """A level with its FAST corners, and the cell of the grid that each lies in."""
+        # corners as flat indices of the image
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
+        # the grid begins where the first corner may lie
         cell = self.settings.cell_px
         origin = EDGE - 3
         # cells a row, rounded up
@@ -173,6 +177,7 @@ class OrbExtractor:
 
     def _describe(self, levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]) -> Keypoints:
         """The keypoints of the chosen corners, indices by level, in pixels of the full image."""
+        # rows of all levels after each other
         counts = [len(index) for index in chosen]
         octave = np.repeat(np.arange(len(levels), dtype=np.int32), counts)
         xy = np.empty((len(octave), 2))
@@ -181,6 +186,7 @@ class OrbExtractor:
         response = np.empty(len(octave), np.float32)
         end = 0
         for level, index in zip(levels, chosen, strict=True):
+            # the level's corners: pixels of the full image, response, orientation and descriptor
             at = level.xy[index]
             rows = slice(end, end + len(index))
             end += len(index)
@@ -192,7 +198,8 @@ class OrbExtractor:
 
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
-    """How many features each level gets: in proportion to its side length, `n_features` in all."""
+    """Number of features of each level: in proportion to its side length, `n_features` in all."""
+    # a level's share; what rounding down leaves goes to the finest
     shares = scale_factor ** -np.arange(levels, dtype=np.float64)
     quotas = np.floor(n_features * shares / shares.sum()).astype(int)
     quotas[:1] += n_features - quotas.sum()
@@ -229,7 +236,8 @@ def spread(
 
 @kernel
 def _occurrences_before(numbers: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """How often each of the numbers ``[N]``, from 0 to `count` - 1, occurs before it."""
+    """Count for each of the numbers ``[N]``, from 0 to `count` - 1, how often it occurs before."""
+    # counted while the numbers are read in order
     occurred = np.zeros(count, np.int64)
     before = np.empty(len(numbers), np.int64)
     for i in range(len(numbers)):

@@ -117,9 +117,11 @@ class CachedExtractor:
         entry = self._cache.get("features", key)
         self.hit = entry is not None
         if entry is not None:
+            # stored: the time that the cache saves is the cost less the look-up
             keypoints = Keypoints(**entry.arrays)
             cost = entry.cost_s
         else:
+            # not stored: extract and time them
             start = time.perf_counter()
             keypoints = compute()
             cost = time.perf_counter() - start

@@ -8,7 +8,7 @@ from dynslam_bench.core.settings import Settings, names, tunable
 
 
 class FeatureSettings(Settings):
-    """How keypoints are extracted and described."""
+    """Extraction and description of keypoints."""
 
     extractor: str = names(
         "orb",

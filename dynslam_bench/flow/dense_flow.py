@@ -116,6 +116,7 @@ class DenseDaisyFlow:
         seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`. The guess is not used."""
+        # flat or tiny images have no flow; unusable points are replaced for the search
         cleaned = clean_points(reference.maps.gray, target.maps.gray, points)
         if isinstance(cleaned, FlowResult):
             return cleaned
@@ -253,6 +254,7 @@ class _RegionLabels:
         target: DescribedImage,
         seed: int,
     ) -> None:
+        # no pixel has a label yet
         self.settings = settings
         self._sparse = sparse
         self._image = reference
@@ -283,6 +285,7 @@ class _RegionLabels:
 
         One pixel in four is looked at: those of even rows and columns.
         """
+        # regions with a pixel, of those looked at, that is not consistent
         regions = self._image.regions
         (height, width) = self._image.half.shape
         fitted = fit_regional_motion(self.flow(), valid, regions, self._image.half)
@@ -302,6 +305,7 @@ class _RegionLabels:
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
+        # regions, images and windows as kernels read them
         image = self._image
         count = len(image.centres)
         regions = RegionArrays(image.regions.members, image.regions.starts, image.centres)
@@ -317,6 +321,7 @@ class _RegionLabels:
             epsilon=np.float32(self.settings.filter_epsilon),
         )
         chosen = ChosenLabels(self._best, self._winner, np.zeros(count, dtype=np.int64))
+        # Eq. 1-3, the regions divided among threads
         self._sparse.workers.run(
             aggregate_and_choose, 0, count, regions, candidates, matching, aggregation, chosen
         )
@@ -370,6 +375,7 @@ def consistent(
             row = np.int64(np.rint(np.float32(y) + v))
             valid[y, x] = False
             if 0 <= column < width and 0 <= row < height:
+                # forward and backward flow together, which is 0 if they agree
                 dx = u + backward[row, column, 0]
                 dy = v + backward[row, column, 1]
                 valid[y, x] = dx * dx + dy * dy <= limit
@@ -451,7 +457,16 @@ def fit_regional_motion(
 
 @kernel
 def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None:
-    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``."""
+    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``.
+
+    Args:
+        flow: float32 ``[H, W, 2]``, pixels.
+        valid: bool ``[H, W]``, consistent pixels.
+        labels: int32 ``[H / 2, W / 2]``, `Superpixels.labels`.
+        sums: Added to: number of pixels, number of consistent ones, and their sums of x, y, u and
+            v.
+    """
+    # a full-image pixel belongs to the region of its half-resolution pixel
     for y in range(len(valid)):
         row = labels[min(y // 2, len(labels) - 1)]
         for x in range(valid.shape[1]):
@@ -498,6 +513,7 @@ def fill_and_smooth(
             dy = np.float32(y) - centres[r, 1]
             u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
             v = motion[r, 0, 1] + dx * motion[r, 1, 1] + dy * motion[r, 2, 1]
+            # the pixel's own flow, where it is consistent and differs clearly
             own_u = flow[y, x, 0]
             own_v = flow[y, x, 1]
             replaced = (
@@ -548,6 +564,7 @@ def superpixels(
     centres[:, 0] = np.tile(x, rows)
     centres[:, 1] = np.repeat(y, columns)
     centres[:, 2] = gray[np.rint(centres[:, 1]).astype(int), np.rint(centres[:, 0]).astype(int)]
+    # k-means in position and grey level
     labels = np.empty((height, width), dtype=np.int32)
     assign_pixels(gray, centres, size, (size / compactness) ** 2, iterations, labels)
 
@@ -562,7 +579,16 @@ def superpixels(
 def assign_pixels(
     gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints
 ) -> None:
-    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
+    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`.
+
+    Args:
+        gray: uint8 ``[H, W]``.
+        centres: float64 ``[K, 3]``: x, y in pixels, and grey level.
+        size: Half side of the window in which a centre competes, pixels.
+        weight: Squared pixels that a squared grey level weighs as much as.
+        iterations: Rounds of assignment and update.
+        labels: int32 ``[H, W]``, filled with each pixel's centre.
+    """
     height, width = gray.shape
     distance = np.empty((height, width), dtype=np.float64)
     sums = np.empty((len(centres), 4), dtype=np.float64)
@@ -601,6 +627,7 @@ def assign_pixels(
                 sums[k, 1] += y
                 sums[k, 2] += gray[y, x]
                 sums[k, 3] += 1
+        # each centre moves to the mean of its pixels
         for k in range(len(centres)):
             if sums[k, 3] > 0:
                 for j in range(3):
@@ -667,6 +694,7 @@ def frame_patch(
         work: float32 ``[8, ...]``, scratch of at least that length; rows 0 to 2: share, mean and
             variance of the guide.
     """
+    # rows of the scratch array by name
     pitch = width + 2 * radius
     n = len(patch)
     patch[:] = 0
@@ -711,6 +739,7 @@ def filter_patch(
         work: float32 ``[8, ...]``, the scratch array that `frame_patch` filled; rows 3 to 6 are
             overwritten.
     """
+    # rows of the scratch array by name
     n = len(patch)
     share = work[0, :n]
     mean = work[1, :n]
@@ -741,9 +770,19 @@ def filter_patch(
 def read_descriptors(
     start: int, stop: int, columns: int, image: ImageArrays, tables: CostTables, out: Words
 ) -> None:
-    """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors."""
+    """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        columns: Half-resolution pixels a row.
+        image: Orientation maps of the image.
+        tables: Tables of the cost, with the sampling pattern.
+        out: Filled.
+    """
     for y in range(start, stop):
         for x in range(columns):
+            # the centre of the half-resolution pixel in the full image
             px = np.float32(2 * x) + np.float32(0.5)
             py = np.float32(2 * y) + np.float32(0.5)
             first = (y * columns + x) * layout.HISTOGRAMS
@@ -926,16 +965,44 @@ def aggregate_and_choose(
             filter_patch(patch[:n], values[:n], pitch, radius, aggregation.epsilon, work)
 
             # Eq. 3: the region's pixels take the label where its cost is the lowest so far
-            for member in region:
-                y = member // columns
-                x = member % columns
-                cost = values[(y - top + radius) * pitch + x - left + radius]
-                if cost < best[y, x]:
-                    best[y, x] = cost
-                    winner[y, x, 0] = u
-                    winner[y, x, 1] = v
-                    winner[y, x, 2] = a
-                    winner[y, x, 3] = b
+            first = (radius - top) * pitch + radius - left
+            take_where_cheaper((u, v, a, b), region, columns, values, pitch, first, best, winner)
+
+
+@inlined
+def take_where_cheaper(
+    label: Similarity,
+    region: Longs,
+    columns: int,
+    values: Floats,
+    pitch: int,
+    first: int,
+    best: Floats,
+    winner: Floats,
+) -> None:
+    """Let the pixels of a region take a label where its aggregated cost is the lowest so far.
+
+    Args:
+        label: The label.
+        region: int64, flat indices of the region's half-resolution pixels.
+        columns: Half-resolution pixels a row.
+        values: float32, flat, aggregated costs of the patch around the region.
+        pitch: Numbers a row of the patch.
+        first: Index in `values` where the image's pixel (0, 0) would lie; may be negative.
+        best: `ChosenLabels.best`, changed.
+        winner: `ChosenLabels.winner`, changed.
+    """
+    u, v, a, b = label
+    for member in region:
+        y = member // columns
+        x = member % columns
+        cost = values[first + y * pitch + x]
+        if cost < best[y, x]:
+            best[y, x] = cost
+            winner[y, x, 0] = u
+            winner[y, x, 1] = v
+            winner[y, x, 2] = a
+            winner[y, x, 3] = b
 
 
 @inlined
@@ -947,7 +1014,16 @@ def differs(
     best: Floats,
     winner: Floats,
 ) -> bool:
-    """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does."""
+    """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does.
+
+    Args:
+        label: The label that is tried.
+        centre: Centre of the region, full-image pixels.
+        region: int64, flat indices of the region's half-resolution pixels.
+        columns: Half-resolution pixels a row.
+        best: `ChosenLabels.best`, infinite where a pixel has no label yet.
+        winner: `ChosenLabels.winner`.
+    """
     u, v, a, b = label
     limit = np.float32(SAME_PX * SAME_PX)
     for member in region:
@@ -970,7 +1046,15 @@ def differs(
 
 @inlined
 def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge."""
+    """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge.
+
+    Args:
+        members: int64, flat indices of the pixels.
+        rows: Rows of the image.
+        columns: Columns of the image.
+        margin: Pixels around the box.
+    """
+    # the box around the pixels
     top = rows
     bottom = -1
     left = columns
@@ -982,6 +1066,8 @@ def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[
         bottom = max(bottom, y)
         left = min(left, x)
         right = max(right, x)
+
+    # with the margin, within the image
     top = max(top - margin, 0)
     left = max(left - margin, 0)
     bottom = min(bottom + margin, rows - 1)
@@ -1049,6 +1135,7 @@ def raw_costs(
             cost = np.int64(tables.ceiling)
             if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
                 cost = np.int64(descriptor_distance(tx, ty, si, ti, described, at, target, tables))
+                # grey level and gradient, the other two terms of Eq. 1
                 if tables.appearance:
                     gray, gradient = appearance(target, tx, ty)
                     own_gray, own_gradient = appearance(matching.reference, px, py)
@@ -1061,8 +1148,18 @@ def raw_costs(
 def spread_labels(
     start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats
 ) -> None:
-    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
+    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres.
+
+    Args:
+        start: First row of the full image.
+        stop: One past the last row.
+        winner: float32 ``[h, w, 4]``, `ChosenLabels.winner`.
+        regions: int32 ``[h, w]``, `Superpixels.labels`.
+        centres: float32 ``[K, 2]`` of the regions, full-image pixels.
+        flow: float32 ``[H, W, 2]``, filled.
+    """
     for y in range(start, stop):
+        # the label of the half-resolution pixel
         row = min(y // 2, winner.shape[0] - 1)
         for x in range(flow.shape[1]):
             column = min(x // 2, winner.shape[1] - 1)

@@ -184,6 +184,7 @@ def search_labels(
     Returns:
         The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
     """
+    # the plan, and labels to begin with: the prediction, or zero flow
     points = matching.reference.points
     n = len(points)
     plan = make_plan(settings)
@@ -214,6 +215,7 @@ def start_labels(
     points: NDArray[np.float32], guess: NDArray[np.float32] | None
 ) -> NDArray[np.float32]:
     """Labels ``[N, 1, 4]`` of zero flow, or of the motion model's prediction where it is finite."""
+    # u, v, scale in octaves, rotation in radians
     start = np.zeros((len(points), 1, 4), dtype=np.float32)
     if guess is not None:
         offset = guess - points
@@ -224,7 +226,15 @@ def start_labels(
 def initial_state(
     settings: DaisySettings, start: NDArray[np.float32], population: int, ceiling: int
 ) -> SearchState:
-    """The state before anything was evaluated, with bounds around the start labels ``[N, 1, 4]``."""
+    """The state before anything was evaluated, with bounds around the start labels ``[N, 1, 4]``.
+
+    Args:
+        settings: Range of the search along each dimension of a label.
+        start: Labels in the middle of the bounds: u, v (pixels), log2 of the scale, rotation
+            (radians).
+        population: Labels kept a point.
+        ceiling: Largest possible cost, which no label has been better than yet.
+    """
     n = len(start)
     rotation = np.deg2rad(settings.rotation_range_deg)
     extent = np.array(
@@ -273,9 +283,11 @@ def insert(flames: Floats, costs: Longs, trials: Floats, trial: int, cost: Scala
         trial: Which of them.
         cost: Its cost.
     """
+    # worse than the worst flame
     k = len(costs) - 1
     if cost >= costs[k]:
         return
+    # move worse flames down, and put it in its place
     while k > 0 and costs[k - 1] > cost:
         costs[k] = costs[k - 1]
         for j in range(4):
@@ -300,7 +312,7 @@ CANDIDATES = 0
 INITIAL = 1
 """The first population."""
 OPPOSITES = 2
-"""Its opposites."""
+"""Opposites of the first population."""
 SEARCH = 3
 """Moths that fly, or labels that are drawn, until the evaluations are spent."""
 
@@ -332,6 +344,7 @@ def run_phase(
         seed: Seed of the frame's random draws.
         rules: `SearchRules`.
     """
+    # numbers that hold for all points, and scratch arrays
     population = state.costs.shape[1]
     opposition = rules.flights.opposition
     iterations = len(rules.flights.counts)
@@ -433,7 +446,16 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
 def place_moths(
     moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar
 ) -> Scalar:
-    """Draw the moths from `placed` on within the bounds, and try them; returns the next random state."""
+    """Draw the moths from `placed` on within the bounds, and try them; returns the next random state.
+
+    Args:
+        moths: float32 ``[P, 4]``, the population; filled from `placed` on.
+        placed: Moths that have a place already.
+        lower: float32 ``[4]``, least values of a label.
+        upper: float32 ``[4]``, largest values of a label.
+        trials: float32 ``[P, 4]``, filled with the moths that are placed now.
+        random: State of the point's random numbers.
+    """
     for m in range(placed, len(moths)):
         random = advance(random)
         bits = scrambled(random)
@@ -467,6 +489,7 @@ def opposite_labels(
             low[j] = min(low[j], moths[m, j])
             high[j] = max(high[j], moths[m, j])
     for m in range(population):
+        # one number for the factor, four for the draw, whether they are needed or not
         random = advance(random)
         factor = uniform(scrambled(random), 0)
         random = advance(random)
@@ -563,7 +586,14 @@ def draw_label(
 ) -> None:
     """Fill a label: anywhere in the bounds (`shrink` 1), or in a window around the best label.
 
-    `window` is half the window's side as a share of the bounds' extent.
+    Args:
+        label: float32 ``[4]``, filled.
+        bits: 64 random bits.
+        lower: float32 ``[4]``, least values.
+        upper: float32 ``[4]``, largest values.
+        best: float32 ``[4]``, the best label so far.
+        window: Half side of the window around it, as a share of the bounds' extent.
+        shrink: Factor by which the window shrinks a draw; 1 for draws anywhere.
     """
     for j in range(4):
         extent = upper[j] - lower[j]
@@ -590,6 +620,7 @@ def parabola(
     """
     unbounded = np.int64(1 << 40)
     for i in range(start, stop):
+        # costs at the label, and one step to each side along x and along y
         u = labels[i, 0]
         v = labels[i, 1]
         s = labels[i, 2]
@@ -600,6 +631,8 @@ def parabola(
         up = label_cost(i, (u, v - step, s, theta), matching, unbounded)
         down = label_cost(i, (u, v + step, s, theta), matching, unbounded)
         used[i] += 5
+
+        # each axis has a parabola of its own
         labels[i, 0] = u + step * vertex(left, middle, right)
         labels[i, 1] = v + step * vertex(up, middle, down)
 
@@ -607,6 +640,7 @@ def parabola(
 @inlined
 def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
     """Position of the minimum of a parabola through values at -1, 0, 1, within these; 0 if it is not convex."""
+    # second difference: of a parabola the curvature
     curvature = before + after - 2 * middle
     if curvature <= 0:
         return np.float32(0)
@@ -675,6 +709,7 @@ def propagated_labels(
             u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
             v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
             store_candidate(out[i, k], (u, v, labels[j, 2], labels[j, 3]), lower[i], upper[i])
+        # the common motions, applied to this point
         for m in range(len(motions)):
             a = motions[m, 0]
             b = motions[m, 1]
@@ -789,6 +824,7 @@ def ransac_similarity(
     Returns:
         The next state of the draws.
     """
+    # where the tracks begin and end
     x = tracks[0]
     y = tracks[1]
     to_x = tracks[2]
@@ -817,6 +853,7 @@ def ransac_similarity(
             continue
         tx = to_x[i] - a * x[i] + b * y[i]
         ty = to_y[i] - b * x[i] - a * y[i]
+        # the motion with the most voters is kept
         inliers = count_inliers(voters, a, b, tx, ty, limit)
         if inliers > most:
             most = inliers
@@ -831,13 +868,24 @@ def ransac_similarity(
 def count_inliers(
     voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar
 ) -> int:
-    """How many voters a motion takes to where their labels do, by squared distance."""
+    """Count the voters that a motion takes to where their labels do, by squared distance.
+
+    Args:
+        voters: float32 ``[4, M]``: x and y of points, and where their labels take them.
+        a: Scale times cosine of the rotation.
+        b: Scale times sine of the rotation.
+        tx: Translation along x, pixels.
+        ty: Translation along y, pixels.
+        limit: Squared distance, pixels, below which a voter agrees.
+    """
+    # where voters are, and where they go
     from_x = voters[0]
     from_y = voters[1]
     goal_x = voters[2]
     goal_y = voters[3]
     inliers = np.int32(0)
     for k in range(voters.shape[1]):
+        # what the motion misses the goal by
         rx = a * from_x[k] - b * from_y[k] + tx - goal_x[k]
         ry = b * from_x[k] + a * from_y[k] + ty - goal_y[k]
         inliers = np.int32(inliers + np.int32(rx * rx + ry * ry < limit))
@@ -854,6 +902,7 @@ def nearest(points: Floats, run: Run) -> Longs:
     Returns:
         int64 ``[N, K]``, K = `MOST_NEIGHBOURS` or N - 1; -1 where there are fewer.
     """
+    # sorted by x, so that near points follow each other
     n = len(points)
     neighbours = np.empty((n, max(0, min(MOST_NEIGHBOURS, n - 1))), dtype=np.int64)
     if n > 1:

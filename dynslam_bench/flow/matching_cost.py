@@ -182,7 +182,16 @@ def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
 def read_descriptor(
     x: Scalar, y: Scalar, image: ImageArrays, tables: CostTables, out: Words, first: int
 ) -> None:
-    """Write the unrotated descriptor of a position: 17 histograms, a number each, of `out` from `first` on."""
+    """Write the unrotated descriptor of a position: 17 histograms, a number each, of `out` from `first` on.
+
+    Args:
+        x: Column, full-image pixels.
+        y: Row, full-image pixels.
+        image: Orientation maps of the image.
+        tables: Tables of the cost, with the sampling pattern.
+        out: uint64, a histogram of eight bytes each.
+        first: Index of the first histogram.
+    """
     neutral = -layout.SCALE_LOW
     straight = -layout.ANGLE_LOW
     histograms = image.histograms.view(np.uint64)

@@ -289,7 +289,16 @@ def smooth_line(
 def normalise_line(
     line: Halves, at: int, columns: int, floor: float, cells: Bytes, first: int
 ) -> None:
-    """Partially normalised bytes of one row; bytes that the last vector writes into the margin are cleared."""
+    """Partially normalised bytes of one row; bytes that the last vector writes into the margin are cleared.
+
+    Args:
+        line: uint16, flat, blurred histograms of eight bins.
+        at: Index of the row's first bin.
+        columns: Histograms of the row.
+        floor: Added to the norm, so that weak gradients stay small.
+        cells: uint8, flat, all maps; filled.
+        first: Index of the row's first byte in it.
+    """
     length = 8 * columns
     for i in range(0, length, 32):
         store_normalised(cells, first + i, load_uint16(line, at + i), floor)
@@ -299,7 +308,15 @@ def normalise_line(
 
 @inlined
 def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None:
-    """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side."""
+    """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side.
+
+    Args:
+        gray: uint8 ``[H, W]``.
+        row: Row of the half-resolution image.
+        sums: uint16, flat, filled.
+        at: Index of the row's first sum in it.
+        columns: Pixels of a half-resolution row.
+    """
     height, width = gray.shape
     upper = gray[min(2 * row, height - 1)]
     lower = gray[min(2 * row + 1, height - 1)]
@@ -315,7 +332,15 @@ def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None
 
 @inlined
 def quarter_line(rows: Halves, upper: int, lower: int, columns: int, target: Halves) -> None:
-    """Means of 2 x 2 histograms of the rows that begin at `upper` and `lower`; a single column is its own neighbour."""
+    """Means of 2 x 2 histograms of the rows that begin at `upper` and `lower`; a single column is its own neighbour.
+
+    Args:
+        rows: uint16, flat, rows of half-resolution histograms of eight bins.
+        upper: Index at which the upper row begins.
+        lower: Index at which the lower row begins.
+        columns: Histograms of such a row.
+        target: uint16, filled with a row of quarter resolution.
+    """
     for k in range(8):
         for row in (lower, upper):
             rows[row + 8 * columns + k] = rows[row + 8 * columns - 8 + k]

@@ -262,9 +262,9 @@ def similarity_lucas_kanade(
         correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1
             if flat or outside.
     """
+    # pixels of the window, and scratch arrays for it
     side = 2 * window.radius + 1
     n = np.float64(side * side)
-    half = np.float32(0.5)
     scale_down = np.float32(1) / np.float32(window.step)
     space = make_workspace(window.radius, window.margin)
     for i in range(start, stop):
@@ -284,14 +284,8 @@ def similarity_lucas_kanade(
         if template.energy < n * FLAT_VARIANCE:
             continue
 
-        # the label as a warp; its translation is in pixels of the target with its border
-        scale = np.float32(np.exp2(labels[i, 2]))
-        warp = Warp(
-            np.float64(scale * np.float32(np.cos(labels[i, 3]))),
-            np.float64(scale * np.float32(np.sin(labels[i, 3]))),
-            framed(points[i, 0] + labels[i, 0], scale_down),
-            framed(points[i, 1] + labels[i, 1], scale_down),
-        )
+        # warps, beginning with that of the label
+        warp = warp_of_label(labels[i], points[i], scale_down)
         initial = np.float32(-1)
         best = np.float32(-1)
         best_warp = warp
@@ -304,6 +298,7 @@ def similarity_lucas_kanade(
             alignment, best, best_warp = align_translation(
                 space, gradients, template, warp, window, n, best, best_warp
             )
+            # the correlation of the label that was given
             if number == 0:
                 initial = alignment.initial
             warp = Warp(
@@ -319,6 +314,7 @@ def similarity_lucas_kanade(
             similarity_equations(space, gradients, template, alignment, window, n)
             if not cholesky_solve(space.hessian, space.steepest):
                 break
+            # the increment as a similarity; 2, because gradients are differences over two pixels
             da = np.float32(1) + 2 * np.float32(space.steepest[2])
             db = 2 * np.float32(space.steepest[3])
             size = da * da + db * db
@@ -335,16 +331,37 @@ def similarity_lucas_kanade(
         # the best warp as a label, where it is better than the label that was given
         correlation[i] = best
         if best > initial:
-            a = best_warp.a
-            b = best_warp.b
-            labels[i, 0] = (
-                (best_warp.x - BORDER + half) * np.float32(window.step) - half - points[i, 0]
-            )
-            labels[i, 1] = (
-                (best_warp.y - BORDER + half) * np.float32(window.step) - half - points[i, 1]
-            )
-            labels[i, 2] = half * np.float32(np.log2(a * a + b * b))
-            labels[i, 3] = np.float32(np.arctan2(b, a))
+            store_label(labels[i], points[i], best_warp, window.step)
+
+
+@inlined
+def warp_of_label(label: Floats, point: Floats, scale_down: Scalar) -> Warp:
+    """The warp of a label; its translation is in pixels of the target with its border.
+
+    Args:
+        label: float32 ``[4]``: u, v (full-image pixels), log2 of the scale, rotation (radians).
+        point: float32 ``[2]``, full-image pixels.
+        scale_down: Pixels of the target in a full-image pixel.
+    """
+    scale = np.float32(np.exp2(label[2]))
+    return Warp(
+        np.float64(scale * np.float32(np.cos(label[3]))),
+        np.float64(scale * np.float32(np.sin(label[3]))),
+        framed(point[0] + label[0], scale_down),
+        framed(point[1] + label[1], scale_down),
+    )
+
+
+@inlined
+def store_label(label: Floats, point: Floats, warp: Warp, step: int) -> None:
+    """Write a warp as a label, the inverse of `warp_of_label`; `step`: full-image pixels in a target pixel."""
+    half = np.float32(0.5)
+    a = warp.a
+    b = warp.b
+    label[0] = (warp.x - BORDER + half) * np.float32(step) - half - point[0]
+    label[1] = (warp.y - BORDER + half) * np.float32(step) - half - point[1]
+    label[2] = half * np.float32(np.log2(a * a + b * b))
+    label[3] = np.float32(np.arctan2(b, a))
 
 
 @inlined
@@ -388,7 +405,17 @@ def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
 
 @inlined
 def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: Floats) -> None:
-    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
+    """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on.
+
+    Args:
+        image: uint8 ``[H, W]``.
+        x: Column of the first sample, pixels.
+        y: Row of the first sample, pixels.
+        rows: Rows of samples.
+        pitch: Samples a row.
+        out: float32, flat, filled.
+    """
+    # the pixel that contains (x, y), and the parts of a pixel beyond it
     flat = image.reshape(-1)
     stride = np.int64(image.shape[1])
     column = np.int64(x)
@@ -399,6 +426,7 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
     for block in range((pitch + 15) // 16):
         first = min(16 * block, max(pitch - 16, 0))
         at = row * stride + column + first
+        # a row of samples between columns, then between two such rows
         above = load_bytes(flat, at)
         above = above + right * (load_bytes(flat, at + 1) - above)
         for r in range(rows):
@@ -411,7 +439,14 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
 
 @inlined
 def warp_patch(image: Bytes, warp: Warp, reach: int, space: Workspace) -> None:
-    """Fill the patch: bilinear samples of a square of radius `reach` pixels under the warp."""
+    """Fill the patch: bilinear samples of a square of radius `reach` pixels under the warp.
+
+    Args:
+        image: uint8 ``[H, W]``, the target with its border.
+        warp: Where the window's centre lies in it, with scale and rotation.
+        reach: Half side of the square.
+        space: Its `patch` is filled.
+    """
     # positions are whole numbers of 65536ths of a pixel
     one = np.float32(65536)
     far = np.float32(reach)
@@ -436,6 +471,7 @@ def warp_patch(image: Bytes, warp: Warp, reach: int, space: Workspace) -> None:
 @inlined
 def template_gradients(space: Workspace, n: float) -> Gradients:
     """Fill the template's gradients from its samples, central differences; returns their sums over `n` pixels."""
+    # sums over the window, sixteen pixels at a time
     pitch = space.pitch
     frame = space.frame
     zero = spread(np.float32(0))
@@ -458,6 +494,7 @@ def template_gradients(space: Workspace, n: float) -> Gradients:
         yy = yy + gy * gy
         store(space.gradient_x, k, gx)
         store(space.gradient_y, k, gy)
+    # the sixteen sums of a vector, added up
     x = np.float64(total(sum_x))
     y = np.float64(total(sum_y))
     # removing a patch's mean removes the gradients' means from the Hessian
@@ -479,6 +516,7 @@ def smaller_eigenvalue(gradients: Gradients) -> Scalar:
 @inlined
 def centre_template(space: Workspace, gradients: Gradients, n: float) -> Template:
     """Fill the template, the samples less their mean over `n` pixels; returns its sums."""
+    # grey levels less their mean, and their sums with themselves and the gradients
     mean = np.float32(gradients.levels / n)
     mean_t = spread(mean)
     zero = spread(np.float32(0))
@@ -508,7 +546,14 @@ def bilinear_weights(x: Scalar, y: Scalar) -> tuple[Scalar, Scalar, Scalar, Scal
 def shifted(
     patch: Floats, k: int, pitch: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> Scalar:
-    """Sixteen pixels of the patch from index k on, shifted by a part of a pixel (`bilinear_weights`)."""
+    """Sixteen pixels of the patch from index k on, shifted by a part of a pixel (`bilinear_weights`).
+
+    Args:
+        patch: float32, flat, grey levels.
+        k: Index of the first pixel.
+        pitch: Pixels a row.
+        weights: Bilinear weights of the four pixels around each.
+    """
     w00, w01, w10, w11 = weights
     upper = w00 * load(patch, k) + w01 * load(patch, k + 1)
     return upper + w10 * load(patch, k + pitch) + w11 * load(patch, k + pitch + 1)
@@ -519,6 +564,7 @@ def patch_shift(
     x: Scalar, y: Scalar, margin: int, pitch: int
 ) -> tuple[Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
     """An offset of the window in the patch: index of the window's first pixel, weights of the part of a pixel."""
+    # whole pixels go into the index, the rest into the weights
     left = x + np.float32(margin)
     top = y + np.float32(margin)
     column = np.int64(left)
@@ -530,7 +576,15 @@ def patch_shift(
 def compare_with_template(
     space: Workspace, mean: Scalar, at: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
 ) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
-    """Sums over the window of the patch w, less the template's mean: of w, w^2, and w times template and gradients."""
+    """Sums over the window of the patch w, less the template's mean: of w, w^2, and w times template and gradients.
+
+    Args:
+        space: Patch, template and its gradients.
+        mean: Mean grey level of the template.
+        at: Index of the window's first pixel in the patch.
+        weights: Bilinear weights of the part of a pixel by which the window is shifted.
+    """
+    # sums over the window, sixteen pixels at a time
     mean_t = spread(mean)
     zero = spread(np.float32(0))
     sum_w = zero
@@ -574,6 +628,7 @@ def align_translation(
     Returns:
         Where the translation ended, and the highest correlation with its warp.
     """
+    # a window that reaches the patch's edge goes no further
     limit = np.float32(window.margin) - np.float32(0.01)
     x = np.float32(0)
     y = np.float32(0)
@@ -586,6 +641,7 @@ def align_translation(
     for iteration in range(window.iterations + 1):
         sampled_x = x
         sampled_y = y
+        # sums over the patch at the offset so far
         at, weights = patch_shift(x, y, window.margin, space.pitch)
         sum_w, ww, wt, wx, wy = compare_with_template(space, template.mean, at, weights)
 
@@ -621,12 +677,14 @@ def align_translation(
         dy = np.float32(
             2 * (gradients.xx * residual_y - gradients.xy * residual_x) / gradients.determinant
         )
+        # inverse compositional: the increment of the template is taken back
         x = x - dx
         y = y - dy
         if not (abs(x) < limit and abs(y) < limit):
             x = min(max(x, -limit), limit)
             y = min(max(y, -limit), limit)
             break
+        # a step below the tolerance
         if dx * dx + dy * dy < window.tolerance * window.tolerance:
             break
     alignment = Alignment(x, y, sampled_x, sampled_y, mean, residual_x, residual_y, initial)
@@ -647,6 +705,7 @@ def similarity_equations(
     Derivatives at offset (dx, dy) from the window's centre: ``s = gx dx + gy dy``, ``r = gy dx - gx
     dy``. As in `align_translation` the means of all derivatives are removed.
     """
+    # the patch where it was sampled last
     at, weights = patch_shift(alignment.sampled_x, alignment.sampled_y, window.margin, space.pitch)
     mean_t = spread(template.mean)
     zero = spread(np.float32(0))
@@ -688,6 +747,7 @@ def similarity_equations(
         rt = rt + r * t
         ws = ws + w * s
         wr = wr + w * r
+    # the means of the derivatives are removed with these sums
     s_total = np.float64(total(sum_s))
     r_total = np.float64(total(sum_r))
     mean = alignment.mean

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from dynslam_bench.core import DynslamError, RunError, read_lines
 from dynslam_bench.core.fingerprint import Machine
 from dynslam_bench.core.records import Record, schema
+from dynslam_bench.gate.config import GateConfig
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.store import RunStore, evaluation_code
 
@@ -39,6 +40,7 @@ class Measurement(Record):
         frame_time_s: Median time of a frame; None where it is not known.
         memory_mb: Largest memory; None where it is not known.
         trajectories: SHA-256 of the poses by the trajectory, ``online`` and ``final``.
+        data: Digest of the sequence's content; empty where it is not known.
         program: Code, weights and libraries that made it, as short texts.
     """
 
@@ -47,11 +49,12 @@ class Measurement(Record):
     run_id: str = ""
     status: str
     reason: str = ""
-    ate_m: float | None = Field(default=None, ge=0)
+    ate_m: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     coverage: float | None = Field(default=None, ge=0, le=1)
     frame_time_s: float | None = None
     memory_mb: float | None = None
     trajectories: dict[str, str] = Field(default_factory=dict)
+    data: str = ""
     program: dict[str, str] = Field(default_factory=dict)
 
     @property
@@ -92,6 +95,7 @@ def measurement_of(
         frame_time_s=record.frame_time_s,
         memory_mb=record.peak_memory_mb,
         trajectories={which: text for which, text in digests.items() if text},
+        data=record.sequence.content,
         program=record.program,
     )
 
@@ -135,6 +139,10 @@ class Side:
         """Rounds that all cases have."""
         return min((len(runs) for runs in self.by_case.values()), default=0)
 
+    def cases_of_copies(self, rounds: int) -> list[str]:
+        """Cases whose first rounds are all the same trajectories: they show no scatter."""
+        return [case for case in self.by_case if _are_copies(self.of(case, rounds))]
+
     def errors(self, cases: Iterable[str], rounds: int) -> Array:
         """Errors in metres of cases and rounds ``[S, K]``; nan is a lost run."""
         return _matrix([[run.ate_m for run in self.of(case, rounds)] for case in cases])
@@ -146,6 +154,12 @@ class Side:
     def memory(self, cases: Iterable[str], rounds: int) -> Array:
         """Largest memory in MB ``[S, K]``; nan where it is not known."""
         return _matrix([[run.memory_mb for run in self.of(case, rounds)] for case in cases])
+
+
+def _are_copies(runs: list[Measurement]) -> bool:
+    """Whether there are several runs, and all have the same trajectories."""
+    first = runs[0].trajectories
+    return len(runs) > 1 and bool(first) and all(run.trajectories == first for run in runs)
 
 
 def _matrix(rows: list[list[float | None]]) -> Array:
@@ -192,11 +206,12 @@ class Baseline(Record):
         runs: The development set.
         confirmation: The confirmation set; empty without one.
         looks: What became known of the confirmation set: one line for each look at it.
+        notes: What a reader should know, a line each.
     """
 
     schema_version: int = schema(BASELINE_SCHEMA)
     question: str
-    asked: dict[str, Any]
+    asked: GateConfig
     protocol: str
     protocol_digest: str
     code: str = Field(default_factory=evaluation_code)
@@ -207,10 +222,25 @@ class Baseline(Record):
     runs: list[Measurement]
     confirmation: list[Measurement] = Field(default_factory=list)
     looks: list[str] = Field(default_factory=list)
+    notes: list[str] = Field(default_factory=list)
 
-    def changed(self, asked: dict[str, Any]) -> list[str]:
+    @model_validator(mode="after")
+    def _rounds_are_in_order(self) -> Baseline:
+        for runs in (self.runs, self.confirmation):
+            made: dict[str, int] = {}
+            for run in runs:
+                expected = made.get(run.case, 0)
+                if run.round != expected:
+                    raise ValueError(
+                        f"{run.case} has round {run.round} where {expected} is expected"
+                    )
+                made[run.case] = expected + 1
+        return self
+
+    def changed(self, asked: GateConfig) -> list[str]:
         """What of the question is other than when the baseline was recorded, a line each."""
-        return _differences(self.asked, asked)
+        before = self.asked.model_dump(mode="json")
+        return _differences(before, asked.model_dump(mode="json"))
 
 
 def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
@@ -231,6 +261,8 @@ def read_baseline(path: Path) -> Baseline:
     Raises:
         RunError: There is none, or it is damaged.
     """
+    if path.is_dir():
+        raise RunError(f"{path} is a folder, no baseline file", "name the file with --baseline")
     if not path.is_file():
         raise RunError(
             f"there is no baseline {path}",

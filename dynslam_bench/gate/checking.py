@@ -37,6 +37,7 @@ from dynslam_bench.gate.revisions import (
     build,
     checked_out,
     commit_of,
+    untracked_files,
     working_tree,
 )
 from dynslam_bench.gate.trajectory_folder import import_folder
@@ -46,6 +47,8 @@ RESULTS = "results/gate"
 """Where runs and results of gates are kept, a folder each."""
 RECORDED_ROUNDS = 2
 """Rounds that `record` makes: with two of each side the files alone can tell scatter from change."""
+_LISTED = 3
+"""Names in a note."""
 BASELINE = "baseline"
 CANDIDATE = "candidate"
 OnRun = Callable[[str, str, int], None]
@@ -276,14 +279,16 @@ def record(
     file = _baseline_path(gate, output)
     cases = gate.cases()
     confirm = gate.cases(confirm=True) if gate.config.confirm else {}
-    check_sequences(cases | confirm, gate)
+    check_sequences(cases | confirm, gate, 1 if trajectories is not None else rounds)
+    looks, notes = _looks_before(file, gate)
     place = _new_results(results)
 
     # measure development and confirmation set
     if trajectories is None:
         origin = working_tree(gate.folder, (gate.path, file))
         _refuse_uncommitted(origin, uncommitted=uncommitted)
-        build(gate.config.build, gate.folder, origin.name)
+        notes += _notes_on_untracked(gate, (gate.path, file, Path(results).expanduser()))
+        notes += _built_here(gate, gate.config.build, origin, file)
         with ExitStack() as stack:
             program = _started(stack, BASELINE, gate.folder, gate, place)
             runs = _measured(program, cases, gate, rounds, on_run).all(rounds)
@@ -305,7 +310,7 @@ def record(
         origin.name = "the recorded baseline"
     baseline = Baseline(
         question=gate.config.question,
-        asked=gate.config.model_dump(mode="json"),
+        asked=gate.config,
         protocol=gate.protocol.id,
         protocol_digest=gate.protocol.digest(),
         origin=origin,
@@ -314,7 +319,8 @@ def record(
         versions=versions(),
         runs=runs,
         confirmation=confirmed,
-        looks=_looks_before(file, gate),
+        looks=looks,
+        notes=notes,
     )
     write_atomic(file, baseline.to_json())
     return baseline
@@ -337,13 +343,56 @@ def _refuse_uncommitted(origin: Origin, *, uncommitted: bool) -> None:
         )
 
 
-def _looks_before(file: Path, gate: Gate) -> list[str]:
-    """The looks at the same confirmation set that an older baseline file has counted."""
-    if not file.is_file():
+def _built_here(gate: Gate, command: str, origin: Origin, baseline: Path) -> list[str]:
+    """Build the working tree.
+
+    Returns:
+        What it did to tracked files: those would count as changes of the next gate.
+
+    Raises:
+        RunError: The build fails.
+    """
+    build(command, gate.folder, origin.name, gate.config.build_minutes)
+    if not command:
         return []
-    older = read_baseline(file)
-    is_same = older.asked.get("confirm") == list(gate.config.confirm)
-    return older.looks if is_same else []
+    after = working_tree(gate.folder, (gate.path, baseline))
+    changed = [name for name in after.uncommitted if name not in origin.uncommitted]
+    if not changed:
+        return []
+    return [f"the build changed tracked files: {', '.join(changed)}; put back: git checkout"]
+
+
+def _notes_on_untracked(gate: Gate, own: tuple[Path, ...]) -> list[str]:
+    """Files here that the recorded revision does not hold, although the runs may read them."""
+    names = untracked_files(gate.folder, own)
+    if not names:
+        return []
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return [
+        f"no revision holds {', '.join(names[:_LISTED])}{more}: commit what runs read, ignore what a build makes"
+    ]
+
+
+def _looks_before(file: Path, gate: Gate) -> tuple[list[str], list[str]]:
+    """The looks at the same confirmation set that an older baseline file has counted, and what to know of them.
+
+    Raises:
+        RunError: A folder lies where the file is to be written.
+    """
+    if file.is_dir():
+        raise RunError(f"{file} is a folder", "name a file with --baseline")
+    if not file.is_file():
+        return [], []
+    try:
+        older = read_baseline(file)
+    except RunError as error:
+        # a damaged file is replaced: its error tells to record again
+        lost = (
+            f"looks at the confirmation set in the older file are not counted on: {error.args[0]}"
+        )
+        return [], [lost]
+    is_same = older.asked.confirm == gate.config.confirm
+    return (older.looks if is_same else []), []
 
 
 # -- check ---------------------------------------------------------------------------------------------
@@ -387,7 +436,7 @@ def check(
     _refuse_other_protocol(recorded, gate)
     cases = gate.cases(confirm=confirm)
     side = _recorded_side(recorded, cases, confirm=confirm)
-    check_sequences(cases, gate)
+    check_sequences(cases, gate, 1 if trajectories is not None else gate.config.rounds)
     place = _new_results(results)
     place.mkdir(parents=True)
 
@@ -400,12 +449,12 @@ def check(
         outcome = _judged_by_files(side, candidate, recorded, gate)
     else:
         origin = working_tree(gate.folder, (gate.path, file))
-        build(gate.config.build, gate.folder, origin.name)
+        notes += _built_here(gate, gate.config.build, origin, file)
         again = not files_only and _can_run_again(recorded.origin, gate)
         with ExitStack() as stack:
             outcome = _checked(stack, side, recorded, cases, gate, place, on_run, again=again)
     result = _result(outcome, gate, recorded.origin, origin, place, notes)
-    result.changed_question = recorded.changed(gate.config.model_dump(mode="json"))
+    result.changed_question = recorded.changed(gate.config)
     if confirm:
         _count_look(result, recorded, file)
     return _written(result, place)
@@ -464,19 +513,37 @@ def _checked(
 
     # both in turns
     before = stack.enter_context(checked_out(gate.folder, recorded.origin.revision))
-    build(gate.config.build, before, f"revision {recorded.origin.revision[:12]}")
+    revision = f"revision {recorded.origin.revision[:12]}"
+    build(gate.config.build, before, revision, gate.config.build_minutes)
     baseline = _started(stack, BASELINE, before, gate, place)
     candidate = _started(stack, CANDIDATE, gate.folder, gate, place)
     findings, rounds = _in_turns(baseline, candidate, cases, gate, on_run)
     notes = _notes_on_program(recorded_side, baseline.side)
+    notes += _notes_on_data(recorded_side, baseline.side)
     return _GateOutcome(findings, rounds, reran=True, notes=notes)
 
 
 def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate) -> _GateOutcome:
-    """The verdict by recorded runs alone, which are looked at once."""
+    """The verdict by recorded runs alone, which are looked at once.
+
+    Raises:
+        RunError: Both sides saw other data.
+    """
+    _refuse_other_data(side, candidate)
     rounds = min(side.rounds(), candidate.rounds())
-    findings = judge(side, candidate, gate.config, rounds, one_look=True, timed=False)
     notes = []
+    for measured in (side, candidate):
+        copies = measured.cases_of_copies(rounds)
+        if not copies:
+            continue
+        notes.append(
+            f"runs of the {measured.name} are equal to the last bit on {', '.join(copies)}"
+        )
+        # without any scatter every difference would count as certain
+        if len(copies) == len(measured.by_case):
+            rounds = 1
+            notes[-1] += ", so its scatter is not known"
+    findings = judge(side, candidate, gate.config, rounds, one_look=True, timed=False)
     if rounds < 2 and findings.verdict is GateVerdict.UNDECIDED:
         notes.append(
             "one recorded run a sequence can show that all is identical, and nothing else: record two rounds or more"
@@ -484,6 +551,41 @@ def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate
     if not recorded.origin.revision or recorded.origin.uncommitted:
         notes.append("the baseline has no revision to be run again: its recorded runs were judged")
     return _GateOutcome(findings, rounds, notes=notes)
+
+
+def _cases_of_other_data(recorded: Side, measured: Side) -> list[str]:
+    """Cases whose sequence has another content than when the baseline was recorded."""
+    changed = []
+    for case, runs in measured.by_case.items():
+        before = recorded.by_case[case][0].data
+        after = runs[0].data
+        if before and after and before != after:
+            changed.append(case)
+    return changed
+
+
+def _refuse_other_data(recorded: Side, candidate: Side) -> None:
+    """Refuse to compare errors on sequences that have changed.
+
+    Raises:
+        RunError: Names them.
+    """
+    changed = _cases_of_other_data(recorded, candidate)
+    if changed:
+        raise RunError(
+            f"the baseline was recorded on other data of {', '.join(changed)}: the content of the sequence differs",
+            "put the data back, or record the baseline again on these: dynslam-bench gate record",
+        )
+
+
+def _notes_on_data(recorded: Side, again: Side) -> list[str]:
+    """Sequences that have changed since the baseline was recorded; both sides ran on what they are now."""
+    changed = _cases_of_other_data(recorded, again)
+    if not changed:
+        return []
+    return [
+        f"{', '.join(changed)} had other data when the baseline was recorded: both sides ran on what is here now"
+    ]
 
 
 def _can_run_again(origin: Origin, gate: Gate) -> bool:
@@ -601,7 +703,7 @@ def compare(
     """
     gate = load_gate(path, data_root=data_root)
     cases = gate.cases(confirm=confirm)
-    check_sequences(cases, gate)
+    check_sequences(cases, gate, gate.config.rounds)
     command = gate.config.build if build_command is None else build_command
     commit_a = commit_of(gate.folder, revision_a)
     origin_a = Origin(name=f"revision {revision_a}", revision=commit_a)
@@ -612,18 +714,20 @@ def compare(
     with ExitStack() as stack:
         # both revisions are checked out and built before anything runs
         folder_a = stack.enter_context(checked_out(gate.folder, commit_a))
-        build(command, folder_a, origin_a.name)
+        minutes = gate.config.build_minutes
+        build(command, folder_a, origin_a.name, minutes)
         notes = []
         if revision_b:
             commit_b = commit_of(gate.folder, revision_b)
             origin_b = Origin(name=f"revision {revision_b}", revision=commit_b)
             folder_b = stack.enter_context(checked_out(gate.folder, commit_b))
+            build(command, folder_b, origin_b.name, minutes)
             if here.uncommitted:
                 notes.append(f"uncommitted changes in {', '.join(here.uncommitted)} take no part")
         else:
             origin_b = here
             folder_b = gate.folder
-        build(command, folder_b, origin_b.name)
+            notes += _built_here(gate, command, origin_b, file)
 
         place.mkdir(parents=True)
         program_a = _started(stack, BASELINE, folder_a, gate, place)
@@ -657,7 +761,7 @@ def _result(
     findings = outcome.findings
     estimate = findings.estimate
     result = GateResult(
-        verdict=findings.verdict,
+        verdict=findings.overall,
         exit_code=findings.exit_code,
         question=gate.config.question,
         protocol=gate.protocol.id,
@@ -679,12 +783,17 @@ def _result(
             result.low = math.exp(estimate.low)
             result.high = math.exp(estimate.high)
             result.level = findings.level
-    result.sentence = _sentence(result)
+    result.sentence = _sentence(result, findings.verdict)
     return result
 
 
-def _sentence(result: GateResult) -> str:
-    """The verdict in one sentence."""
+def _sentence(result: GateResult, by_error: GateVerdict) -> str:
+    """The verdict in one sentence.
+
+    Args:
+        result: All but the sentence.
+        by_error: The verdict on the error alone, which a guardrail may have overruled.
+    """
     lost, lost_baseline = result.lost
     number = len(result.cases)
     on = f"{number} sequence{'s' * (number != 1)}"
@@ -695,10 +804,12 @@ def _sentence(result: GateResult) -> str:
         )
     if all(case.baseline_m is None for case in result.cases):
         return f"all runs of the baseline were lost or failed on {on}, so nothing can be compared"
-    broken = "".join(f"; guardrail broken: {guardrail.text}" for guardrail in result.broken)
+    overruling = "".join(
+        f"guardrail {guardrail.state}: {guardrail.text}; " for guardrail in result.overruling
+    )
     more_lost = f"; lost runs {lost_baseline} -> {lost}" if lost != lost_baseline else ""
     if result.ratio is None:
-        return f"nothing could be compared on {on}{more_lost}{broken}"
+        return f"{overruling}nothing could be compared on {on}{more_lost}"
     percent = 100.0 * (result.ratio - 1.0)
     measured = f"{abs(percent):.1f} % {'more' if percent > 0 else 'less'} error on {on}"
     words = {
@@ -708,7 +819,7 @@ def _sentence(result: GateResult) -> str:
         GateVerdict.NO_DIFFERENCE: f"{measured}; differences above {100 * result.margin:g} % are excluded",
         GateVerdict.UNDECIDED: f"{measured} so far, within the scatter",
     }
-    return words[result.verdict] + more_lost + broken
+    return overruling + words[by_error] + more_lost
 
 
 def _written(result: GateResult, place: Path) -> GateResult:

@@ -21,6 +21,8 @@ GATE_FILE = "gate.toml"
 """Where the command line looks for the question."""
 TRAJECTORIES = "trajectories"
 """Name of the system where only trajectory files are judged."""
+FEWEST_FRAMES = 2
+"""Frames that a run needs: the first one is where it begins."""
 Cases = dict[str, RunSpec]
 """Name to what is run; each round runs it from another start frame, with another seed."""
 
@@ -68,6 +70,7 @@ class GateConfig(Record):
         minutes: No round begins later than this; None for no such limit.
         seed: Seed of the first round.
         build: Command that builds a checkout, in the file's folder of it.
+        build_minutes: Longest time that a build may take.
         environment: Environment variables of the runs; ``{folder}`` is the file's folder in the
             checkout that is run.
         guardrails: What must not get worse beside the error.
@@ -89,8 +92,9 @@ class GateConfig(Record):
     margin: float = Field(default=MARGIN, gt=0, le=1)
     rounds: Literal[2, 3, 4, 6, 8, 10] = 10
     minutes: float | None = Field(default=None, gt=0)
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**31)
     build: str = ""
+    build_minutes: float = Field(default=60, gt=0, allow_inf_nan=False)
     environment: dict[str, str] = Field(default_factory=dict)
     guardrails: Guardrails = Guardrails()
     limits: Limits = Limits()
@@ -264,24 +268,42 @@ def spec_of_round(spec: RunSpec, gate: Gate, number: int) -> RunSpec:
     return spec.model_copy(update=update)
 
 
-def check_sequences(cases: Mapping[str, RunSpec], gate: Gate) -> None:
-    """Open every sequence of a gate.
+def check_sequences(cases: Mapping[str, RunSpec], gate: Gate, rounds: int) -> None:
+    """Open every sequence of a gate, before anything is built or run.
+
+    Args:
+        cases: What a round runs.
+        gate: Its gate.
+        rounds: Rounds at most.
 
     Raises:
-        RunError: Some cannot be opened: how many, which, and why the first one cannot.
+        RunError: Some cannot be opened (how many, which, and why the first one cannot), or are too
+            short for the start frame of the last round.
     """
-    missing = {}
+    faults: dict[str, DynslamError] = {}
     for name, spec in cases.items():
         try:
-            open_frames(spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride)
+            frames = open_frames(
+                spec.sequence, spec.data_root, spec.camera, spec.frames, spec.stride
+            )
         except DynslamError as error:
-            missing[name] = error
-    if missing:
-        first = next(iter(missing.values()))
+            faults[name] = error
+            continue
+        needed = spec.offset + rounds - 1 + FEWEST_FRAMES
+        if len(frames) < needed:
+            faults[name] = RunError(
+                f"{len(frames)} frames are too few: round {rounds} begins {rounds - 1} frames later, "
+                f"so {needed} are needed",
+                "name more frames, or fewer rounds",
+            )
+    if faults:
+        first = next(iter(faults.values()))
         raise RunError(
-            f"{len(missing)} of {len(cases)} sequences of {gate.path.name} cannot be opened "
-            f"({', '.join(missing)}): {first.args[0]}",
-            first.hint or f"put them below {gate.data_root}, or name their folder with --data-root",
+            f"{len(faults)} of {len(cases)} sequences of {gate.path.name} cannot be used "
+            f"({', '.join(faults)}): {first.args[0]}",
+            first.hint
+            or "change sequences or frames there; recordings are looked for in "
+            f"{gate.data_root}, or in --data-root",
         )
 
 

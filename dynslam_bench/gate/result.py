@@ -69,7 +69,7 @@ class GateResult(Record):
 
     Attributes:
         schema_version: Version of this record's fields.
-        verdict: Verdict on the error.
+        verdict: Verdict on error and guardrails. *identical*, *improved* and *no difference* pass.
         exit_code: 0 passed, 3 runs failed, 4 regressed or a guardrail is broken, 5 undecided.
         sentence: The verdict in words.
         question: Digest of the question.
@@ -127,9 +127,11 @@ class GateResult(Record):
         return self.exit_code == PASSED
 
     @property
-    def broken(self) -> list[GuardrailResult]:
-        """The guardrails that are broken."""
-        return [guardrail for guardrail in self.guardrails if guardrail.state == "broken"]
+    def overruling(self) -> list[GuardrailResult]:
+        """The guardrails that keep the gate from passing: broken ones, else those that cannot be judged."""
+        states = {REGRESSED: ("broken",), UNDECIDED: ("open", "not measured")}
+        kept = states.get(self.exit_code, ())
+        return [guardrail for guardrail in self.guardrails if guardrail.state in kept]
 
     @property
     def worst(self) -> CaseResult | None:

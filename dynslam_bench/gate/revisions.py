@@ -16,6 +16,7 @@ from typing import Any
 from dynslam_bench.core import InfrastructureError, RunError, translate_errors
 from dynslam_bench.gate import worker
 from dynslam_bench.gate.baseline import Origin
+from dynslam_bench.runs.process.process_trees import end_tree
 from dynslam_bench.runs.spec import RunSpec
 
 WORKING_TREE = "the working tree"
@@ -33,16 +34,29 @@ def git(folder: Path, *arguments: str) -> str:
     with translate_errors(RunError, "git cannot be started", "install git"):
         ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode != 0:
-        words = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
-        raise RunError(f"git {arguments[0]}: {words[-1]}")
+        lines = ended.stderr.strip().splitlines() or [f"exit code {ended.returncode}"]
+        # advice may follow the fault
+        fatal = [line for line in lines if line.startswith("fatal:")]
+        raise RunError(f"git {arguments[0]}: {(fatal or lines)[-1]}")
     return ended.stdout.strip()
 
 
 def repository_of(folder: Path) -> Path | None:
-    """The top folder of the repository that a folder lies in; None where it lies in none."""
+    """The top folder of the repository that a folder lies in; None where it lies in none.
+
+    Raises:
+        RunError: Git refuses to read it, e.g. because the folder belongs to another user.
+    """
     try:
         return Path(git(folder, "rev-parse", "--show-toplevel"))
-    except RunError:
+    except RunError as error:
+        # git looks upwards for a folder .git; where there is one, it had another reason
+        above = (folder.absolute(), *folder.absolute().parents)
+        if any((place / ".git").exists() for place in above):
+            raise RunError(
+                f"git does not read the repository of {folder}: {error.args[0]}",
+                f"in containers often: git config --global --add safe.directory {folder}",
+            ) from None
         return None
 
 
@@ -60,11 +74,30 @@ def working_tree(folder: Path, own: tuple[Path, ...] = ()) -> Origin:
         revision = git(top, "rev-parse", "HEAD")
     except RunError:  # nothing is committed yet
         return Origin(name=WORKING_TREE)
-    lines = git(top, "status", "--porcelain", "--untracked-files=no").splitlines()
     ignored = {path.resolve() for path in own}
-    changed = [line.split(maxsplit=1)[1] for line in lines]
-    uncommitted = [name for name in changed if (top / name).resolve() not in ignored]
+    changed = git(top, "diff", "--name-only", "-z", "HEAD").split("\0")
+    uncommitted = [name for name in changed if name and (top / name).resolve() not in ignored]
     return Origin(name=WORKING_TREE, revision=revision, uncommitted=uncommitted)
+
+
+def untracked_files(folder: Path, own: tuple[Path, ...] = ()) -> list[str]:
+    """Files of the working tree that git neither tracks nor ignores: no revision holds them.
+
+    Args:
+        folder: A folder in it.
+        own: Files and folders of the gate, which do not count.
+    """
+    top = repository_of(folder)
+    if top is None:
+        return []
+    names = git(top, "ls-files", "-z", "--others", "--exclude-standard").split("\0")
+    ignored = {path.resolve() for path in own}
+    return [name for name in names if name and not _lies_in((top / name).resolve(), ignored)]
+
+
+def _lies_in(file: Path, places: set[Path]) -> bool:
+    """Whether a file is one of some places, or lies below one."""
+    return not places.isdisjoint((file, *file.parents))
 
 
 def commit_of(folder: Path, revision: str) -> str:
@@ -78,13 +111,18 @@ def commit_of(folder: Path, revision: str) -> str:
             f"{folder} lies in no git repository, so it has no revision {revision}",
             "run git init and commit, or name a folder in a repository",
         )
+    asked = f"{revision}^{{commit}}"
     try:
-        return git(folder, "rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}")
+        commit = git(folder, "rev-parse", "--verify", "--quiet", asked)
     except RunError:
+        commit = ""
+    # of "^HEAD" git makes a revision that is left out
+    if not commit.isalnum():
         raise RunError(
             f"there is no revision '{revision}' in {repository_of(folder)}",
             "list them with git log --all --oneline; a shallow clone lacks old ones: git fetch --unshallow",
-        ) from None
+        )
+    return commit
 
 
 @contextmanager
@@ -118,28 +156,52 @@ def checked_out(folder: Path, revision: str) -> Iterator[Path]:
             git(top, "worktree", "remove", "--force", str(place))
 
 
-def build(command: str, folder: Path, name: str) -> None:
+def build(command: str, folder: Path, name: str, minutes: float) -> None:
     """Run the command that builds a checkout.
 
     Args:
         command: For the shell; empty for none.
         folder: Folder in which the command runs.
         name: What is built, for messages.
+        minutes: Longest time that it may take.
 
     Raises:
-        RunError: It fails; quotes its last lines.
+        RunError: It fails, or does not end in time; quotes its last lines.
     """
     if not command:
         return
     with tempfile.TemporaryFile("w+", errors="replace") as log:
-        ended = subprocess.run(
-            command, shell=True, cwd=folder, stdout=log, stderr=subprocess.STDOUT, check=False
+        # without standard input: a question of the build ends it
+        process = subprocess.Popen(
+            command,
+            shell=True,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
         )
+        # it has a group of its own: a build that hangs, and one that is interrupted, end with all they started
+        code: int | None = None
+        try:
+            code = process.wait(timeout=60.0 * minutes)
+        except subprocess.TimeoutExpired:
+            pass
+        finally:
+            if code is None:
+                end_tree(process.pid)
+                process.wait()
         log.seek(0)
-        last = deque((line.strip() for line in log if line.strip()), maxlen=_LAST_LINES)
-    if ended.returncode != 0:
+        last = " | ".join(deque((line.strip() for line in log if line.strip()), maxlen=_LAST_LINES))
+    words = last or "it wrote nothing"
+    if code is None:
         raise RunError(
-            f"the build of {name} failed with exit code {ended.returncode}: {' | '.join(last)}",
+            f"the build of {name} did not end in {minutes:g} minutes: {words}",
+            f"try it there: {command}; or raise build_minutes in the question",
+        )
+    if code != 0:
+        raise RunError(
+            f"the build of {name} failed with exit code {code}: {words}",
             f"try it there: {command}",
         )
 

@@ -18,6 +18,8 @@ sys.path[:] = [place for place in sys.path if Path(place).resolve() != HERE]
 
 def make(request: dict[str, Any]) -> dict[str, str]:
     """Make one run."""
+    from pydantic import ValidationError
+
     from dynslam_bench.core import DynslamError
     from dynslam_bench.runs import RunSpec, run_many
 
@@ -25,6 +27,11 @@ def make(request: dict[str, Any]) -> dict[str, str]:
         spec = RunSpec.model_validate(request["spec"])
         records = run_many([spec], results=request["results"])
         return {"run_id": records.run_ids[0]}
+    except ValidationError as error:
+        # the checkout's own version of this package may not know all that was asked for
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        return {"error": f"the package in {Path.cwd()} refuses the run: {field}: {first['msg']}"}
     except DynslamError as error:
         return {"error": str(error.args[0]), "hint": error.hint}
 

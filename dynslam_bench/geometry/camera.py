@@ -130,6 +130,7 @@ class Camera:
             return pixels
         import cv2
 
+        # at most 20 iterations, until a step is below 1e-9
         coefficients = np.asarray(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
         # the distortion is inverted by iteration; older OpenCV has criteria under another name
@@ -144,7 +145,7 @@ class Camera:
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
     def undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
+        """Places of an undistorted image's pixels in the distorted one: columns and rows, ``[H, W]``."""
         import cv2
 
         distortion = np.asarray(self.distortion)

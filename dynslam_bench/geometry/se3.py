@@ -79,17 +79,28 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
     """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and quaternions ``[..., 4]`` in TUM's order qx qy qz qw.
 
     Quaternions of any length but 0 are rotations, also of one whose square is no number any more.
+    The rotation has the bits of SciPy's, which takes a third of a second to load.
     """
-    # loaded when needed: code that only copies poses does not load it
-    from scipy.spatial.transform import Rotation
-
     # very large and very small numbers are scaled, so that their squares are numbers
     quaternion = np.asarray(quaternion, dtype=np.float64)
     largest = np.abs(quaternion).max(axis=-1, keepdims=True, initial=0.0)
     if ((largest > _SQUARES) | ((largest > 0) & (largest < 1 / _SQUARES))).any():
         quaternion = quaternion / np.where(largest > 0, largest, 1.0)
-    rotation = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
-    return from_matrix(translation, rotation.reshape(*quaternion.shape[:-1], 3, 3))
+
+    # unit length; the squares are added one after the other
+    x, y, z, w = np.moveaxis(quaternion, -1, 0)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    if not length.all():
+        raise ValueError("a quaternion of length 0 is no rotation")
+    x, y, z, w = np.moveaxis(quaternion / length[..., None], -1, 0)
+
+    rows = [
+        [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w],
+    ]
+    rotation = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return from_matrix(translation, rotation)
 
 
 def to_quaternion(pose: Array) -> tuple[Array, Array]:

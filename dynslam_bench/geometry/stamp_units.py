@@ -58,7 +58,7 @@ SLOWEST_FINE_S = 4.0
 SPARSE_S = 60.0
 """Keyframes of a camera that hardly moves may be as far apart."""
 SHORTEST_S = 0.5
-"""Where a smaller unit would make a shorter recording than this, the stamps are sparse keyframes."""
+"""Duration: where a smaller unit would make a shorter recording than this, the stamps are sparse keyframes."""
 UNIX_S = 1e9
 """Unix time of the year 2001: stamps between it and `LATEST_S` are Unix time."""
 LEAST_STATED_S = 1e-6

@@ -142,6 +142,7 @@ def associate(
 @lru_cache(maxsize=512)
 def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tuple[Index, Index]:
     """`associate`, once for equal stamps: all runs on one sequence are compared with the same truth."""
+    # both lists in order of time, and where each stamp stood
     a, order_a = _sorted_stamps(np.frombuffer(first))
     b, order_b = _sorted_stamps(np.frombuffer(second))
     if not max_dt >= 0:
@@ -159,6 +160,8 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
                 match_of[i] = j
                 taken.add(j)
         pairs = np.array(sorted(match_of.items()), dtype=np.intp).reshape(-1, 2)
+
+    # back to the order that was given; cached results must not be changed
     index_a = order_a[pairs[:, 0]]
     index_b = order_b[pairs[:, 1]]
     index_a.flags.writeable = False
@@ -168,6 +171,7 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
 
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf without any."""
+    # infinite stamps at both ends, so that each stamp has one before and one after
     a = np.asarray(first, dtype=np.float64).reshape(-1)
     ordered = np.sort(np.asarray(second, dtype=np.float64).reshape(-1))
     b = np.concatenate([[-np.inf], ordered, [np.inf]])
@@ -189,7 +193,14 @@ def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], In
 def _candidates(
     a: NDArray[np.float64], b: NDArray[np.float64], max_dt: float, *, strict: bool
 ) -> tuple[Index, Index, NDArray[np.float64]]:
-    """All pairs of indices within `max_dt` with their |dt|; both lists sorted."""
+    """All pairs of indices within `max_dt` with their |dt|; both lists sorted.
+
+    Args:
+        a: Stamps in seconds ``[N]``, ascending.
+        b: Stamps in seconds ``[M]``, ascending.
+        max_dt: Largest time difference, seconds.
+        strict: Whether the difference must be smaller.
+    """
     # Look a little farther than `max_dt`, as sums round; the differences decide.
     slack = 1e-9 + 4 * np.spacing(max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)))
     low = np.searchsorted(b, a - max_dt - slack, side="left")

@@ -53,7 +53,7 @@ class RoundReport:
     """The board of a round.
 
     Attributes:
-        remarks: What holds for all rows, a line each.
+        remarks: Remarks on the whole board, a line each.
         rows: The entries, the best first.
         faults: What is wrong with the results, a line each; rows of such runners are shown all the
             same.
@@ -147,7 +147,7 @@ def _board_row(opened: RoundFolder, entry: str, rows: list[ScoredRow]) -> BoardR
 
 
 def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
-    """What holds for all rows."""
+    """Remarks that hold for all rows."""
     of = opened.round
     late = opened.late_entries()
     remarks = [

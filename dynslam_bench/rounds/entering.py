@@ -30,6 +30,8 @@ TRIAL_SCENE = 100
 """The public scene of the trial: the first held-out one."""
 TRIAL_FRAMES = 60
 """Frames of the trial at most: two seconds."""
+_PROGRAMS = ("subprocess:", "batch:")
+"""How the names of trackers begin that are programs, whose files no package holds."""
 
 
 def enter(
@@ -71,8 +73,13 @@ def enter(
         on_step("running it on a public scene")
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
-    program = program_of(record.identity)
-    _check_new(opened, tracker, program)
+    program = program_of(name, record.identity)
+    if tracker.startswith(_PROGRAMS) and not program.files:
+        raise RunError(
+            f"the program of '{tracker}' does not lie in entries/{name}: nobody could tell whether it changes",
+            f"put its files into {opened.root / 'entries' / name}, and name them from the round's folder",
+        )
+    check_is_new(opened, tracker, program)
     entry = Entry(
         name=name,
         round_sha256=opened.sha256,
@@ -116,7 +123,7 @@ def _check_open(opened: RoundFolder, name: str, now: datetime) -> None:
         )
 
 
-def _check_new(opened: RoundFolder, tracker: str, program: Program) -> None:
+def check_is_new(opened: RoundFolder, tracker: str, program: Program) -> None:
     """Check that no entry has the same program: the two would share their runs.
 
     Raises:

@@ -24,9 +24,9 @@ from dynslam_bench.sequences.synthetic.sealed import ROUND_NAME, parse_salt, sea
 from dynslam_bench.sequences.synthetic.settings import MAX_FRAMES, RENDERER_VERSION
 
 ROUND_FILE = "round.json"
-"""What the organiser publishes first."""
+"""File that the organiser publishes first."""
 REVEAL_FILE = "reveal.json"
-"""What the organiser publishes after the deadline."""
+"""File that the organiser publishes after the deadline."""
 RESULTS_FILE = "results.json"
 """Says which rows a runner's bank holds."""
 ROUND_SCHEMA = 1
@@ -101,7 +101,7 @@ class Round(RoundRecord):
         ]
 
     def label_of(self, sequence: str, salt: bytes) -> str:
-        """How a scene is named in tables: ``walking_xyz 3``; its id where it is none of the round's."""
+        """Name of a scene in tables: ``walking_xyz 3``; its id where it is none of the round's."""
         ids = self.sequences(salt)
         if sequence not in ids:
             return sequence
@@ -114,12 +114,12 @@ class Round(RoundRecord):
         Raises:
             RunError: The renderer, a family or the protocol has another version.
         """
-        here = renderer_versions(self.families)
-        for part, version in self.renderer.items():
-            if here.get(part) != version:
+        for part, version in renderer_versions(self.families).items():
+            stated = self.renderer.get(part)
+            if stated != version:
                 what = "the renderer" if part == "renderer" else f"family '{part}'"
                 raise RunError(
-                    f"round {self.name} was made with version {version} of {what}, here it is {here.get(part)}",
+                    f"round {self.name} was made with version {stated} of {what}, here it is {version}",
                     "install the release of dynslam-bench that the round was made with",
                 )
         digest_here = get_protocol(self.protocol).digest()
@@ -159,7 +159,7 @@ class Program(Record):
         settings: All settings by dotted name.
         code: Digest of the code of each part, of the tracker's version and of packages that it needs.
         weights: Digests of the networks.
-        files: Digests of the entrant's own files, below the round's folder or beside the plug-in.
+        files: Digests of the entrant's own files, in ``entries/NAME`` or beside the plug-in.
     """
 
     settings: dict[str, Any]
@@ -205,7 +205,7 @@ class Entry(RoundRecord):
 
 
 class Reveal(RoundRecord):
-    """What ends a round: the salt, and the entries that were received in time.
+    """The end of a round: the salt, and the entries that were received in time.
 
     Attributes:
         round_sha256: SHA-256 of ``round.json``.
@@ -229,7 +229,7 @@ class Row(Record):
 
 
 class Results(RoundRecord):
-    """What a runner has run: describes the bank beside it.
+    """Results of a runner: describes the bank beside it.
 
     Attributes:
         by: Name of the runner.
@@ -315,7 +315,7 @@ class RoundFolder:
         return self.round.sequences(self.salt)
 
     def entry_file(self, name: str) -> Path:
-        """Where an entry lies."""
+        """Path of an entry."""
         return self.root / "entries" / f"{name}.json"
 
     def entry_names(self) -> list[str]:

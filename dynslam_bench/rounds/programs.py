@@ -1,4 +1,4 @@
-"""What of an entry's tracker is frozen, and what of it has changed."""
+"""The program of an entry's tracker: what is frozen, and what of it has changed."""
 
 import contextlib
 import json
@@ -8,16 +8,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core.libraries import library_identity
 from dynslam_bench.core.reads import ABSENT, UNREADABLE, BaseFolders, Reads, Verifier
 from dynslam_bench.rounds.files import Entry, Program
 from dynslam_bench.runs.identity import resolve
-from dynslam_bench.runs.own_code import module_of
+from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 
 _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 """The part of an absolute path that differs from machine to machine: the round's folder."""
-_OWN_FILES = ("plugin:", "work:")
-"""How names of files begin that lie beside the plug-in or below the round's folder, see `BaseFolders`."""
-_COMMAND_FILES = "the files that its command names"
+_PLUGIN_FILES = "plugin:"
+_ENTRY_FILES = "work:/entries/"
+"""Beginnings of names of files that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
 _VERSION = "its version"
 
 
@@ -32,28 +33,32 @@ def working_in(folder: Path) -> Iterator[None]:
         os.chdir(before)
 
 
-def program_of(identity: Mapping[str, Any]) -> Program:
+def program_of(name: str, identity: Mapping[str, Any]) -> Program:
     """The frozen part of a run's identity.
 
     Args:
+        name: Name of the entry, whose files lie in ``entries/NAME``, or beside the plug-in.
         identity: As a run's record has it, or as `ResolvedRun.stated` gives it before the run: then
             what a plug-in reads is not known yet.
     """
     # the code: of each part, of packages that the tracker needs, its own version
     code = {str(part): str(digest) for part, digest in identity.get("source", {}).items()}
-    code |= {f"package {name}": str(text) for name, text in identity.get("requires", {}).items()}
+    code |= {f"package {top}": str(text) for top, text in identity.get("requires", {}).items()}
+    for part in identity.get("parts", ()):
+        if is_outside_package(part) and not is_file(part):
+            package = module_of(part).partition(".")[0]
+            code[f"package {package}"] = library_identity(package)
     code[_VERSION] = str(identity.get("tracker_version", ""))
 
-    # the files that a plug-in or a program has read, of which those of the system differ by machine
+    # the files that a plug-in or a program has read, without those of the system: these differ by machine
     files = {}
     reads = identity.get("reads")
     if reads is not None:
         read = Reads.model_validate(reads)
-        for name, digest in {**read.programs, **read.files}.items():
-            if name.startswith(_OWN_FILES) and digest not in (ABSENT, UNREADABLE):
-                files[name] = digest
-    if "files" in identity:
-        files[_COMMAND_FILES] = str(identity["files"])
+        own = (_PLUGIN_FILES, f"{_ENTRY_FILES}{name}/")
+        for file, content in {**read.programs, **read.files}.items():
+            if file.startswith(own) and content not in (ABSENT, UNREADABLE):
+                files[file] = content
     return Program(
         settings=_portable(identity.get("settings", {})),
         code=_portable(code),
@@ -81,11 +86,10 @@ def what_changed(entry: Entry, root: Path, sequence: str) -> str:
     """
     resolved = resolve(entry.spec(sequence))
     # what the entrant has written
-    own = {name: digest for name, digest in entry.program.files.items() if name != _COMMAND_FILES}
     folders = BaseFolders(plugin=resolved.base_folders.plugin, work=root)
-    if changed := Verifier().changed(Reads(files=own), folders):
+    if changed := Verifier().changed(Reads(files=entry.program.files), folders):
         return changed
-    return difference(entry.program, program_of(resolved.stated))
+    return difference(entry.program, program_of(entry.name, resolved.stated))
 
 
 def difference(frozen: Program, now: Program) -> str:

@@ -32,7 +32,7 @@ OnEvent = Callable[[RunEvent], None]
 
 @dataclass(frozen=True)
 class RoundRuns:
-    """What a runner has made of a round.
+    """Runs that a runner has made of a round.
 
     Attributes:
         results: The description of the bank.

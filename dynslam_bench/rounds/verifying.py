@@ -44,12 +44,12 @@ class RerunRow:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was checked of a round.
+    """Outcome of the checks of a round.
 
     Attributes:
         faults: What is wrong, a line each.
         rows: All rows of the other runners that could be scored.
-        rerun: Those that were run again.
+        rerun: The rows that were run again.
     """
 
     faults: list[str] = field(default_factory=list)
@@ -101,22 +101,22 @@ def verify(
     with working_in(opened.root):
         usable, refused = usable_entries(opened)
     runners = list(of) or [runner for runner in opened.runners() if runner != by]
-    found = Verification(faults=list(refused.values()))
+    verification = Verification(faults=list(refused.values()))
 
     # what each runner has published: checked without a run, then scored again
     for runner in runners:
         on_step(f"checking the results of {runner}")
-        found.faults.extend(faults_of(opened, runner, render=True))
+        verification.faults.extend(faults_of(opened, runner, render=True))
         for row in opened.read_results(runner).rows:
             try:
-                found.rows.append(scored(opened, runner, row))
+                verification.rows.append(scored(opened, runner, row))
             except DynslamError as error:
-                found.faults.append(f"{runner}, {_named(opened, row)}: {error}")
+                verification.faults.append(f"{runner}, {_named(opened, row)}: {error}")
 
     # a sample, run again here
-    pairs = _sample(found.rows, usable, sample)
+    pairs = _sample(verification.rows, usable, sample)
     if not pairs:
-        return found
+        return verification
     chosen = list(dict.fromkeys((entry.name, row.row.sequence) for entry, row in pairs))
     by_name = {entry.name: entry for entry in usable}
     again = make_rows(
@@ -132,22 +132,22 @@ def verify(
     for _, row in pairs:
         made = rows_again.get(row.key)
         if made is None:
-            found.faults.append(f"{_named(opened, row.row)} could not be run again")
+            verification.faults.append(f"{_named(opened, row.row)} could not be run again")
             continue
-        found.rerun.append(_compared(opened, row, scored(opened, by, made)))
-    for rerun in found.rerun:
+        verification.rerun.append(_compared(opened, row, scored(opened, by, made)))
+    for rerun in verification.rerun:
         if rerun.agreement == "differs":
-            found.faults.append(
+            verification.faults.append(
                 f"{rerun.row.by}, {_named(opened, rerun.row.row)}: {_millimetres(rerun.ate_m)} was published, "
                 f"run again it is {_millimetres(rerun.ate_again_m)}"
             )
-    return found
+    return verification
 
 
 def _sample(
     rows: Iterable[ScoredRow], usable: Iterable[Entry], count: int
 ) -> list[tuple[Entry, ScoredRow]]:
-    """Rows of each entry and runner, drawn at random: whoever publishes must not know which."""
+    """Rows of each entry and runner, drawn at random: a runner must not know which."""
     draw = random.SystemRandom()
     every = list(rows)
     pairs = []
@@ -165,7 +165,7 @@ def _compared(opened: RoundFolder, row: ScoredRow, again: ScoredRow) -> RerunRow
 
 
 def faults_of(opened: RoundFolder, by: str, *, render: bool) -> list[str]:
-    """What is wrong with a runner's results, a line each; nothing is run.
+    """Faults of a runner's results, a line each; nothing is run.
 
     Args:
         opened: The round.
@@ -198,7 +198,7 @@ def faults_of(opened: RoundFolder, by: str, *, render: bool) -> list[str]:
 
 
 def _fault_of_row(opened: RoundFolder, by: str, row: Row, sequences: set[str]) -> str:
-    """What is wrong with a row: its entry, its scene, its program or its ground truth; empty for nothing."""
+    """Fault of a row: of its entry, scene, program or ground truth; empty for none."""
     if row.entry not in opened.reveal.entries:
         return f"{REVEAL_FILE} does not list this entry"
     if row.sequence not in sequences:
@@ -210,7 +210,7 @@ def _fault_of_row(opened: RoundFolder, by: str, row: Row, sequences: set[str]) -
         return str(error)
     if record.sequence.id != row.sequence:
         return f"its run is on {record.sequence.id}"
-    if changed := difference(entry.program, program_of(record.identity)):
+    if changed := difference(entry.program, program_of(entry.name, record.identity)):
         return f"it was run by another program than entered: {changed} was changed"
 
     # the ground truth needs no rendering

@@ -81,7 +81,7 @@ class Bank(RunStore):
     """A results folder that takes of a run what scores are computed from, and nothing of the machine that made it."""
 
     def copy_from(self, other: RunStore, record: RunRecord) -> RunRecord:
-        """Copy the record, the trajectories and their covariances, the stamps and the ground truth of a run.
+        """Copy the record, trajectories and covariances of a run, and the stamps and ground truth of its sequence.
 
         Raises:
             InfrastructureError: It cannot be written.

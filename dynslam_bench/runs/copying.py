@@ -36,6 +36,7 @@ def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) 
         merged.left_out.extend(unreadable)
         for run_id in records.run_ids:
             try:
+                # copy each run that may be copied, and is not there already
                 record = source.read_whole(run_id)
                 if record.trial_of and not trials:
                     continue
@@ -52,6 +53,7 @@ def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) 
                 merged.left_out.append(Unreadable(source.shown_folder(run_id), str(error)))
                 continue
             newest = max(newest, (record.started, run_id))
+    # the link to the newest run
     if newest[1]:
         store.link_latest(newest[1])
     return merged
@@ -59,6 +61,7 @@ def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) 
 
 def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
     """Why a run of a store may not be copied into another one; empty if it may, or is there already."""
+    # its sequence: plain files, with stamps, that agree with those of the other store
     part = record.sequence.part
     source_part = source.sequences.folder(part)
     target_part = store.sequences.folder(part)
@@ -72,6 +75,7 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
     if is_part_known and not have_equal_files(source_part, target_part, STAMPS, TRUTH):
         return f"{store.source} holds other stamps or truth of its sequence"
 
+    # the run: there with another result, or with files that have changed
     earlier = store.get(record.run_id)
     if earlier is not None:
         folders = (source.folder(record.run_id), store.folder(record.run_id))

@@ -7,7 +7,7 @@ again while all that was read for it is unchanged.
 import json
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,7 +45,13 @@ from dynslam_bench.runs.own_code import (
     modules_by_component,
     portable_name,
 )
-from dynslam_bench.runs.record import ASKED_DIGITS, IDENTITY_SCHEME, StartMap, run_id_of
+from dynslam_bench.runs.record import (
+    ASKED_DIGITS,
+    IDENTITY_SCHEME,
+    StartMap,
+    digest_of_reads,
+    digest_of_request,
+)
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.networks.checkpoints import CHECKPOINTS
@@ -77,7 +83,9 @@ class ResolvedRun:
         sequence: The opened sequence, cut to the frames asked for.
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
-        identity: What is asked for, and what is known beforehand of what the run will read.
+        identity: What is asked for, and what is known beforehand of what the run will read, as it
+            reads after it was stored.
+        read_digest: The last eight digits of its id: what is known beforehand of what it will read.
         base_folders: The folders in which names of files begin that plug-ins and programs read.
         has_plugins_or_programs: Whether they take part; what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
@@ -91,6 +99,7 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
+    read_digest: str
     base_folders: BaseFolders
     has_plugins_or_programs: bool = False
     start_map: StartMap | None = None
@@ -103,13 +112,8 @@ class ResolvedRun:
 
     @cached_property
     def run_id(self) -> str:
-        """Its id; that of a run with plug-ins or programs changes when it is known what they read."""
-        return run_id_of(self.identity)
-
-    @cached_property
-    def stated(self) -> dict[str, Any]:
-        """The identity as it reads after it was stored."""
-        return dict(json.loads(json.dumps(self.identity, default=str)))
+        """Id of the run; that of a run with plug-ins or programs changes when it is known what they read."""
+        return digest_of_request(self.identity) + self.read_digest
 
     @cached_property
     def plugin_packages(self) -> list[str]:
@@ -158,6 +162,25 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     return Resolver()(spec)
 
 
+_LOOKED_UP = (
+    "tracker",
+    "sequence",
+    "settings",
+    "frames",
+    "offset",
+    "stride",
+    "device",
+    "threads",
+    "cache",
+    "realtime",
+    "drop_share",
+    "degrade",
+    "data_root",
+    "camera",
+)
+"""The fields of a `RunSpec` that are looked up. Runs that are equal in these differ by their seed at most."""
+
+
 class Resolver:
     """Looks up many runs, each sequence, tracker with settings, and device once; see `resolve`.
 
@@ -165,6 +188,7 @@ class Resolver:
     """
 
     def __init__(self) -> None:
+        self._runs: dict[str, ResolvedRun] = {}
         self._whole = lru_cache(maxsize=None)(open_frames)
         self._opened_part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
@@ -176,6 +200,27 @@ class Resolver:
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up everything that decides a run's result, and name it by digests.
 
+        Raises:
+            DynslamError: A name of the request is not known, or a setting does not fit, see
+                `resolve`.
+        """
+        names = [getattr(spec, name) for name in _LOOKED_UP]
+        key = json.dumps(names, sort_keys=True, default=str)
+        run = self._runs.get(key)
+        if run is None:
+            run = self._look_up(spec.absolute())
+            self._runs[key] = run
+        # it may have another seed, and be asked for other pictures
+        absolute = {name: getattr(run.spec, name) for name in _LOOKED_UP}
+        return replace(
+            run,
+            spec=spec.model_copy(update=absolute),
+            identity=run.identity | {"seed": spec.seed},
+        )
+
+    def _look_up(self, spec: RunSpec) -> ResolvedRun:
+        """Look up a run of absolute names; see `__call__`.
+
         The identity has two parts. `asked` is the request: tracker, settings, frames, seed, device.
         `read` is what is known before the run of what it will read: code, libraries, weights, the
         sequence's content. The run's id is made of both (`record.run_id_of`); what a plug-in opens is
@@ -185,7 +230,6 @@ class Resolver:
             DynslamError: A name of the request is not known, or a setting does not fit, see
                 `resolve`.
         """
-        spec = spec.absolute()
         configured = self._configuration(spec)
         tracker = configured.tracker
         settings = configured.settings
@@ -225,6 +269,7 @@ class Resolver:
         }
         if spec.realtime:  # which frames are dropped depends on the machine's speed
             read["machine"] = this_machine().model_dump()
+        identity = json.loads(json.dumps(asked | read, default=str))
         return ResolvedRun(
             spec=spec,
             tracker=tracker,
@@ -232,7 +277,8 @@ class Resolver:
             sequence=sequence,
             device=device,
             segmentation=source,
-            identity=asked | read,
+            identity=identity,
+            read_digest=digest_of_reads(identity),
             base_folders=base_folders,
             has_plugins_or_programs=any(map(is_outside_package, parts)) or bool(tracker.files),
             start_map=start_map,

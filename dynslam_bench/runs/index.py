@@ -185,7 +185,7 @@ class RunIndex:
         )
 
     def _is_plain(self, run_id: str, state: str) -> bool:
-        """Whether the folders of a run and of its sequence's part hold plain files alone."""
+        """Whether the folders of a run and of its sequence's part hold plain files alone, no links or pipes."""
         part = state.partition(" ")[0]
         try:
             check_plain(self.root / "runs" / run_id, self.root)

@@ -1,4 +1,4 @@
-"""Where the files of a store lie, and checks of what lies there."""
+"""Layout of the files of a store, and checks of them."""
 
 from __future__ import annotations
 

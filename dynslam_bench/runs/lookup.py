@@ -32,7 +32,7 @@ class LookUp:
         # a run of built-in parts is found by its id alone
         if not run.has_plugins_or_programs and run.run_id in self._stored_ids[run.request_digest]:
             record = self._store.get(run.run_id)
-            if record is not None and record.identity == run.stated:
+            if record is not None and record.identity == run.identity:
                 return record
         matching = [record for record in self._candidates(run) if self._is_current(record, run)]
         return max(matching, key=lambda record: record.started, default=None)
@@ -44,7 +44,7 @@ class LookUp:
             return ""
         newest = max(candidates, key=lambda record: record.started)
         differing = [
-            name for name, value in run.stated.items() if newest.identity.get(name) != value
+            name for name, value in run.identity.items() if newest.identity.get(name) != value
         ]
         if differing:
             return ", ".join(differing)
@@ -68,9 +68,9 @@ class LookUp:
     def _is_current(self, record: RunRecord, run: ResolvedRun) -> bool:
         """Whether a stored run is what is asked for, and nothing that it read has changed."""
         known_before = {
-            name: value for name, value in record.identity.items() if name in run.stated
+            name: value for name, value in record.identity.items() if name in run.identity
         }
-        if known_before != run.stated:
+        if known_before != run.identity:
             return False
         if not run.has_plugins_or_programs:
             return True

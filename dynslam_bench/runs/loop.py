@@ -229,7 +229,7 @@ class _Recorder:
         return outcome | counts | {"notes": notes}
 
     def _coverage_of_batch(self, final: Trajectory) -> dict[str, int]:
-        """How many frames a batch program has tracked, and how many have no pose at the end."""
+        """Number of frames that a batch program has tracked, and of those that have no pose at the end."""
         tracked = tracked_frames(final, self._env.sequence.timestamps)  # bool, one a frame
         return {"tracked": int(tracked.sum()), "lost_at_end": int(tracked[::-1].argmax())}
 

@@ -65,7 +65,7 @@ _FIELDS_OF_LAST_MESSAGE = ("keyframes", "map_points", "maps", "finalize_s")
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames of a run were tracked, and how many were not.
+    """Number of frames of a run that were tracked, and that were not.
 
     Attributes:
         total: All frames of the run's part of the sequence.
@@ -108,7 +108,7 @@ def make_record(
     last_message = end.final
 
     # a run with plug-ins gets its id now that it is known what they read
-    identity = resolved.stated
+    identity = resolved.identity
     if reads is not None:
         identity = identity | {"reads": reads.model_dump(mode="json")}
 
@@ -274,7 +274,7 @@ def recording_notes(sequence: Sequence) -> list[str]:
 
 
 def tracker_location(run: ResolvedRun) -> dict[str, str]:
-    """Where a tracker is found that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
+    """Place of a tracker that its id alone does not find: `given` and `folder` of `TrackerInfo`."""
     folder = run.base_folders.plugin
     return {
         "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,
@@ -305,7 +305,7 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
 
 
 def sequence_part_digest(identity: dict[str, Any]) -> str:
-    """Names what of the sequence a run saw: content and frames."""
+    """Digest of the part of a sequence that a run saw: content and frames."""
     return digest(
         {key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16
     )

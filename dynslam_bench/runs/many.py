@@ -136,6 +136,7 @@ def run_many(
         DynslamError: The results folder cannot be written, what runs need broke, a network has to
             be fetched first, or, without `on_fault`, a run cannot be made.
     """
+    # statuses of stored runs that are made again
     store = results if isinstance(results, RunStore) else RunStore(results)
     retried = set(retry)
     if "failed" in retried:
@@ -147,6 +148,8 @@ def run_many(
         )
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
+
+    # take what is stored, and make the others here or on the executor
     runs = _ManyRuns(
         store, get_protocol(protocol), jobs, on_plan, on_event, on_progress, cancelled, on_fault
     )
@@ -155,6 +158,8 @@ def run_many(
         runs.make_here()
     else:
         runs.make_remotely(executor)
+
+    # faults, then the records in the order of the specs
     if runs.first_fault is not None and on_fault is None:
         raise runs.first_fault
     finished = [runs.done[run_id] for run_id in runs.run_ids if run_id in runs.done]
@@ -196,6 +201,7 @@ class _ManyRuns:
         plan = PlannedRuns()
         looked_up: set[str] = set()
         for spec in specs:
+            # the run of a spec; equal ones are made once
             run = self._resolve(resolver, spec)
             if run is None:
                 continue
@@ -205,6 +211,7 @@ class _ManyRuns:
             if run.run_id in looked_up:
                 continue
             looked_up.add(run.run_id)
+            # taken as it is stored, or to be made
             stored = stored_runs.find(run)
             if stored is not None and self._is_usable(run, stored, retried):
                 self._reuse(run, stored)

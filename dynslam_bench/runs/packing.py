@@ -38,7 +38,7 @@ def expected_identity(run: ResolvedRun) -> dict[str, Any]:
     """
     parts = [part for part in run.identity["parts"] if is_file(part)]
     files = {part: path_digest(Path(run.base_folders.path(module_of(part)))) for part in parts}
-    return run.stated | {"plug-ins": files}
+    return run.identity | {"plug-ins": files}
 
 
 def run_packed(

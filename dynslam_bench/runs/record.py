@@ -22,7 +22,7 @@ ON_RECORDING = "recording: "
 """Begins a run's notes on what of its recording was not used, or what nobody could mean."""
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-"""How a run ended, see `RunRecord`."""
+"""Status of a run that ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 ASKED = (
@@ -61,16 +61,21 @@ def digest_of_request(identity: Mapping[str, Any]) -> str:
     return digest({name: identity[name] for name in ASKED if name in identity}, ASKED_DIGITS)
 
 
+def digest_of_reads(identity: Mapping[str, Any]) -> str:
+    """The last eight digits of a run's id: what was read for it, which is all that was not asked for."""
+    return digest({name: value for name, value in identity.items() if name not in ASKED}, 8)
+
+
 def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
-    # all that was not asked for was read
-    read = {name: value for name, value in identity.items() if name not in ASKED}
-    return digest_of_request(identity) + digest(read, 8)
+    return digest_of_request(identity) + digest_of_reads(identity)
 
 
-def coverage_text(coverage: float | None) -> str:
-    """The share of tracked frames for people."""
-    return "unknown" if coverage is None else f"{100 * coverage:.1f} %"
+def coverage_text(coverage: float | None, truth_share: float | None = None) -> str:
+    """The share of tracked frames for people; where the frames are not known, that of the ground truth's time."""
+    if coverage is not None:
+        return f"{100 * coverage:.1f} %"
+    return "unknown" if truth_share is None else f"{100 * truth_share:.0f} % of the truth's time"
 
 
 def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
@@ -216,6 +221,8 @@ class RunRecord(Record):
         n_dropped: Frames that never reached the tracker.
         coverage: ``n_tracked / n_frames``; None where the frames are not known, see
             `import_trajectory`.
+        truth_share: Share of the ground truth's time that an imported trajectory has poses for,
+            where its frames are not known; else None.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
         maps: Maps at the end that never met, those of their own begun after a loss among them; None
@@ -274,6 +281,7 @@ class RunRecord(Record):
     n_initialising: int = 0
     n_dropped: int = 0
     coverage: float | None = Field(default=0.0, ge=0, le=1)
+    truth_share: float | None = Field(default=None, ge=0, le=1)
     keyframes: int | None = None
     map_points: int | None = None
     maps: int | None = None
@@ -328,6 +336,14 @@ class RunRecord(Record):
     def incomplete(self) -> bool:
         """Whether it is known that frames have no pose."""
         return self.coverage is not None and self.coverage < 1
+
+    @property
+    def poses_words(self) -> str:
+        """How much of the sequence has a pose: frames of all, or poses and time where the frames are not known."""
+        if self.coverage is not None:
+            return f"{self.n_tracked} of {self.n_frames} frames"
+        share = coverage_text(None, self.truth_share)
+        return f"{self.n_tracked} poses, {share}; the number of frames is not known"
 
     def public(self) -> RunRecord:
         """The record for others: without the command line and the folders of the machine that made it.
@@ -393,7 +409,7 @@ class RunRecord(Record):
         parts = [
             f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"
         ]
-        parts.append(f"coverage {coverage_text(self.coverage)}")
+        parts.append(f"coverage {coverage_text(self.coverage, self.truth_share)}")
         if self.frame_time_s is not None:
             parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
         return ", ".join(parts) + (f" ({self.reason})" if self.reason else "")

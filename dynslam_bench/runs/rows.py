@@ -28,7 +28,12 @@ FIELDS = (
     "ate_rmse_m",
     "static_camera_ate_rmse_m",
     "false_motion_max_m",
+    "nees_1f_mean",
+    "within95_1f",
+    "nees_1s_mean",
+    "within95_1s",
     "coverage",
+    "truth_share",
     "frame_ms",
     "cpu",
     "segmentation",
@@ -69,7 +74,12 @@ def make_run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "static_camera_ate_rmse_m": errors.get("static_camera_ate_rmse_m"),
         "false_motion_max_m": errors.get("false_motion_max_m"),
+        "nees_1f_mean": errors.get("nees_1f_mean"),
+        "within95_1f": errors.get("within95_1f"),
+        "nees_1s_mean": errors.get("nees_1s_mean"),
+        "within95_1s": errors.get("within95_1s"),
         "coverage": _coverage(record, metrics),
+        "truth_share": record.truth_share,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "cpu": None if record.machine is None else record.machine.cpu,
         "segmentation": record.segmentation,
@@ -154,6 +164,7 @@ _INTEGER_COLUMNS = (
 )
 _FLOAT_COLUMNS = (
     "coverage",
+    "truth_share",
     "frame_ms",
     "real_time_factor",
     "finalize_s",
@@ -183,7 +194,8 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
           ``final``): what the errors hold under and are of.
         - ``Int64``: seed, offset, noise (missing for the sequence's own), stride, threads, n_frames, n_processed,
           n_tracked, n_lost, keyframes, map_points, maps.
-        - ``Float64``: coverage (0 to 1), frame_ms (median, milliseconds, segmentation included, decoding excluded),
+        - ``Float64``: coverage (0 to 1), truth_share (0 to 1, of imports whose frames are not
+          known), frame_ms (median, milliseconds, segmentation included, decoding excluded),
           real_time_factor, finalize_s and wall_s (seconds), peak_memory_mb (MB), mask_iou and
           epipolar_skipped (0 to 1), and every metric under its own name with its unit
           (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``, see `Evaluation`); ``ate_rmse_m`` is there even

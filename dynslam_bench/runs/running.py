@@ -196,7 +196,7 @@ def read_reads(work_folder: Path) -> Reads | None:
 
 
 def _watched(work_folder: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
-    """How a run ended; when its fork server dies, the run is repeated with a fork server of its own.
+    """Run in a child process until it ends; when its fork server dies, run it again with a fork server of its own.
 
     No other run is there then. If that server dies, too, it is this run that has killed it: the run
     has crashed.

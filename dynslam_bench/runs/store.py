@@ -354,9 +354,9 @@ class RunStore:
 
     def get(self, run_id: str) -> RunRecord | None:
         """The record of a run by its full id, None if it is not stored or damaged."""
-        folder = self.folder(run_id)
+        checked_id(run_id, "a run's id")
         with contextlib.suppress(DynslamError):
-            return self.read_whole(folder.name)
+            return self.read_whole(run_id)
         return None
 
     def read_whole(self, run_id: str) -> RunRecord:
@@ -366,12 +366,13 @@ class RunStore:
             DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more
                 than plain files.
         """
-        path = self.folder(run_id) / RUN_FILE
-        check_plain(path.parent, self.root)
+        folder = self.folder(run_id)
+        path = folder / RUN_FILE
+        check_plain(folder, self.root)
         try:
             record = RunRecord.read(path)
         except DynslamError as error:
-            if path.parent.is_dir():
+            if folder.is_dir():
                 raise
             raise RunError(f"run {run_id} is not in {self.source}", REMOVED_HINT) from error
         if record.run_id != run_id:
@@ -601,6 +602,7 @@ class RunStore:
         reasons = [f"{entry.path}: {entry.reason}" for entry in unreadable]
 
         def scored() -> Iterator[tuple[RunRecord, MetricRecord | None]]:
+            """Each readable run with its metrics; those that cannot be read give a reason."""
             for run_id in records.run_ids:
                 try:
                     record = self.read_whole(run_id)

@@ -75,31 +75,37 @@ class Installation:
                 setting names.
             plugin: The folder of its plug-in's file.
         """
+        # what the run recorded of its program
         parts = program.get("parts")
         if not isinstance(parts, list) or not isinstance(program.get("source"), dict):
             return NOT_RECORDED
         parts = [str(part) for part in parts]
 
+        # this package's code
         code = _difference(program["source"], source_digests(parts))
         if code is not None:
             return f"the code of {module_of(code)}"
 
+        # libraries that every run computes with
         if self._libraries is None:
             self._libraries = libraries()
         library = _difference(program.get("libraries"), self._libraries)
         if library is not None:
             return library
 
+        # packages that the tracker needs
         required = _table(program.get("requires"))
         package = _difference(required, {module: _package_now(module) for module in required})
         if package is not None:
             return f"the package {package}"
 
+        # weights of its networks
         weights = _table(program.get("weights"))
         file = _difference(weights, {name: _weights_now(name, named[name]) for name in weights})
         if file is not None:
             return f"the weights of {file}"
 
+        # files of plug-ins and programs
         runs_foreign_code = "files" in program or any(map(is_outside_package, parts))
         return self._what_was_read(program, plugin) if runs_foreign_code else ""
 

@@ -56,6 +56,7 @@ NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 
 
 def _builtin() -> Iterable[SegmenterSpec]:
+    """The specs of the segmenters in this package."""
     recorded = "dynslam_bench.segmentation.recorded"
     networks = "dynslam_bench.segmentation.networks"
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"

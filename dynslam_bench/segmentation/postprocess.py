@@ -28,6 +28,7 @@ def dynamic_objects(
     instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()
 ) -> NDArray[np.bool_]:
     """Flags ``[K]`` of objects that count: confident, and of a dynamic class or one of `also`, or known to move."""
+    # by class, or by what is known of the object's motion
     names = expand_classes(settings.classes) | also
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:

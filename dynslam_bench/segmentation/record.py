@@ -48,6 +48,7 @@ def record_masks(
     Raises:
         SegmentationError: The source is ``none`` or not available, or the folder holds other masks.
     """
+    # the segmenter of the settings
     segmenter = build_segmenter(
         settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads
     )
@@ -63,6 +64,7 @@ def record_masks(
     }
     _prepare_folder(folder, origin)
 
+    # an interrupted recording goes on where it ended
     classes = read_classes(folder / CLASSES_FILE)
     segmented = 0
     for index in range(len(sequence)):
@@ -84,6 +86,7 @@ def record_masks(
 
 def _prepare_folder(folder: Path, origin: dict[str, object]) -> None:
     """Make the folder, or make sure that it holds the same masks."""
+    # a folder that was made by this: with equal origin it goes on
     path = folder / ORIGIN_FILE
     if path.is_file():
         stored = read_json(path, kind=SegmentationError)
@@ -108,6 +111,7 @@ def label_image(instances: Instances, classes: dict[int, str]) -> NDArray[np.uin
         classes: The class of each number; a number is added where a frame has more objects of a
             class than before.
     """
+    # numbers of the classes so far
     labels = np.zeros(instances.masks.shape[1:], np.uint16)
     free = sorted(classes)
     # in order of rising score, so that higher ones are written over lower ones

@@ -145,6 +145,7 @@ class MaskScheduler:
             keyframe: Whether the tracker asks for segmentation: on the first frame, after a
                 keyframe, when lost.
         """
+        # no masks of this size can be carried to the first frame
         first = self._gray.shape != gray.shape
         self.async_segmenter_s = 0.0
         if self._settings.schedule == "async" and not first:
@@ -214,6 +215,7 @@ class MaskScheduler:
             covered = select(self._instances, settings).union().mean()
             if covered > settings.crowded_share:
                 return True
+        # every n frames, or with keyframes and after too long a carry
         if settings.schedule == "every_nth":
             return self._age >= settings.n
         return keyframe or self._age >= MAX_CARRY
@@ -227,6 +229,7 @@ def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances,
             segmenter.inner, CachedSegmenter
         ):
             segmenter.inner = segmenter.inner.network()
+        # the time counts only the network's work
         start = time.perf_counter()
         answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
     # raised again where the masks are taken
@@ -258,11 +261,13 @@ class _Track:
 
     def see(self, detections: Instances, index: int, frames: int) -> None:
         """Take over a detection of the object, `frames` frames after the last update."""
+        # velocity of the box, smoothed exponentially
         box = detections.boxes[index]
         velocity = (box - self.box) / np.float32(max(frames, 1))
         self.velocity = np.asarray(
             SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32
         )
+        # the detection replaces what was predicted
         self.score = float(detections.scores[index])
         self.box = box
         self.mask = detections.masks[index]
@@ -278,6 +283,7 @@ class _Track:
         mask = shift_mask(self.mask, float(shift[0]), float(shift[1]), scale)
         if np.count_nonzero(mask) < 0.2 * np.count_nonzero(self.mask):
             return False
+        # within the image; the mask has moved too
         height, width = mask.shape
         self.box = np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
         self.mask = mask
@@ -369,6 +375,7 @@ def associate(
     """Greedy one-to-one pairs (track, detection) of one class by falling box IoU, at least `ASSOCIATION_IOU`."""
     if not predicted or not detections.class_names:
         return []
+    # overlap of all pairs of one class
     same_class = np.array(names)[:, None] == np.array(detections.class_names)[None]
     overlap = np.where(same_class, box_iou(np.stack(predicted), detections.boxes), 0.0)
     pairs = []
@@ -384,9 +391,11 @@ def associate(
 
 def box_iou(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
     """Intersection over union ``[N, M]`` of boxes x0, y0, x1, y1, ``[N, 4]`` and ``[M, 4]``."""
+    # corners of the intersections
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     inter = np.clip(high - low, 0, None).prod(axis=2).astype(np.float64)
+    # areas, 0 for reversed corners
     area_a = np.clip(a[:, 2:] - a[:, :2], 0, None).prod(axis=1).astype(np.float64)
     area_b = np.clip(b[:, 2:] - b[:, :2], 0, None).prod(axis=1).astype(np.float64)
     union = area_a[:, None] + area_b[None] - inter
@@ -513,6 +522,7 @@ def carry_dense(instances: Instances, flow: NDArray[np.float32]) -> Instances:
 
 def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
     """One object's moved mask, computed in a window around the object only."""
+    # the mask at the size of the flow
     moved = np.zeros_like(mask)
     height, width = flow.shape[:2]
     step_y = mask.shape[0] / height
@@ -552,7 +562,14 @@ def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instanc
 def shift_mask(
     mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0
 ) -> NDArray[np.bool_]:
-    """A mask scaled about the centre of its box and moved by `dx`, `dy` pixels."""
+    """A mask scaled about the centre of its box and moved by `dx`, `dy` pixels.
+
+    Args:
+        mask: bool ``[H, W]``.
+        dx: Pixels to the right.
+        dy: Pixels downwards.
+        scale: Factor on its size.
+    """
     rows, columns = np.nonzero(mask)
     if not rows.size:
         return mask

@@ -295,7 +295,7 @@ class SegmentationSettings(Settings):
     """
 
     source: str = "auto"
-    """Where masks come from: ``auto`` (the embedded network on ``synthetic/*``, else ``coco`` or ``selfie``, whichever
+    """Source of masks: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
     was fetched, in this order), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
     (exact masks of the classes alone), ``embedded``, ``coco``, ``selfie`` (MediaPipe's small
     network of people indoors), ``onnx:PATH``, ``tflite:PATH`` (probability maps), ``recorded:DIR``,
@@ -328,7 +328,7 @@ class SegmentationSettings(Settings):
         meaning="networks of probability maps (selfie, tflite): probability above which a pixel is masked",
     )
     map_decay: float = tunable(
-        0.5,
+        0.3,
         low=0.0,
         high=0.9,
         limits=(0.0, 1.0),

@@ -105,7 +105,7 @@ class CatalogueEntry(Settings):
         return self.id.partition("/")[0]
 
     def folders(self, data_root: Path) -> tuple[Path, ...]:
-        """Where the sequence may lie below a data root, the place `fetch` puts it first."""
+        """Folders below a data root where the sequence may lie, the place `fetch` puts it first."""
         inside = data_root / self.dataset
         if not self.distinctive:
             return inside / self.folder, data_root / self.id

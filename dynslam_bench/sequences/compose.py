@@ -299,7 +299,7 @@ class Cutouts:
         return frame.rgb, self._depth(frame, mask), mask
 
     def _nearer(self, frame: Frame) -> NDArray[np.bool_]:
-        """Where a frame is nearer than the background ``[H, W]``."""
+        """Pixels ``[H, W]`` in which a frame is nearer than the background."""
         least = np.maximum(_NEARER_M, _NEARER_SHARE * self._background)
         return np.asarray((frame.depth > 0) & (frame.depth < self._background - least))
 

@@ -1,4 +1,4 @@
-"""How many raw units of a recording's depth make a metre of its ground truth, with a 95 % interval.
+"""Measure the raw units of a recording's depth in a metre of its ground truth, with a 95 % interval.
 
 Between two frames the truth gives the rotation, the corners and their depth give the translation.
 Its length is compared with the true one. What else can lie between the two is estimated along: a
@@ -28,7 +28,7 @@ SHIFT_SIGMA_S = 0.01
 READOUT_S = 0.013
 """Mean of a readout time that the camera does not state: from a global shutter to most of a frame."""
 READOUT_SIGMA_S = 0.013
-"""Its standard deviation."""
+"""Standard deviation of that readout time, seconds."""
 STATED_READOUT_SIGMA_S = 0.005
 """Standard deviation of one that it states."""
 SYSTEMATIC = 0.03
@@ -215,7 +215,15 @@ def _turning_rates(truth: TruthMotion, stamps: Array) -> Array:
 def _at_middle_row(
     points: Array, pixels: Array, rate: Array, camera: Camera, readout_s: float
 ) -> Array:
-    """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows."""
+    """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows.
+
+    Args:
+        points: In the camera at the times of their rows, metres.
+        pixels: Their raw pixels ``[N, 2]``, which tell the rows.
+        rate: Turning rate ``[3]`` of the camera, rad/s in its axes.
+        camera: Its height.
+        readout_s: Seconds from the first row to the last.
+    """
     late = ((pixels[:, 1] + 0.5) / camera.height - 0.5) * readout_s
     return np.asarray(np.einsum("nij,nj->ni", _rotation(late[:, None] * rate), points))
 

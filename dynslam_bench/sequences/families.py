@@ -24,7 +24,7 @@ def family_of(sequence: str) -> str:
 
 
 _POSE = 1e-6
-"""How far poses of one path may lie apart, metres and parts of a rotation matrix: rounding in files."""
+"""Largest distance of poses of one path, metres and parts of a rotation matrix: rounding in files."""
 _SHARED = 0.9
 """Share of the longer path's poses that a copy has at least: a few may be left out, at an end or between."""
 

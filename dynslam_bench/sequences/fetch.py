@@ -105,7 +105,7 @@ class Download(NamedTuple):
 
 
 def status(name: str, *, data_root: str | Path | None = None) -> Path | None:
-    """Where a public sequence lies, None if it is not on this machine.
+    """Folder of a public sequence, None if it is not on this machine.
 
     Raises:
         SequenceError: Unknown id.

@@ -36,7 +36,7 @@ RESAVE = (
 )
 """The cure of a truth that is not in TUM's format."""
 _SO = "so they explain {then:.0f} % of the images' motion, as stored {now:.0f} %"
-"""How much of the motion the truth explains after the cure, and before."""
+"""Words on the shares of the motion that the truth explains after the cure, and before."""
 _FINDINGS: dict[str, tuple[str, str, str]] = {
     # Files that cannot be read, and recordings that are too short.
     "unreadable": (
@@ -140,6 +140,11 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "take the truth of this recording",
     ),
     "truth-far": ("", "{text}", "correct that line of groundtruth.txt, or remove it"),
+    "truth-far/all": (
+        "",
+        "{text}, and the images tell no other motion",
+        "give the positions of groundtruth.txt in metres",
+    ),
     "truth-sparse": (
         "frames",
         "{value:.0f} of {frames} frames have a true pose within {within} s",

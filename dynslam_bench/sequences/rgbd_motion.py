@@ -173,10 +173,16 @@ def follow_corners(
     guess: Pixels,
     tolerance_px: float,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Where corners ``[N, 2]`` of one image lie in the next one, and which were found, by pyramidal Lucas-Kanade.
+    """Find corners ``[N, 2]`` of one image in the next one, and flag those found, by pyramidal Lucas-Kanade.
 
-    A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of
-    where it began. `guess` ``[N, 2]`` is where the search begins.
+    A corner is found if it lies inside the image and, tracked back, ends where it began.
+
+    Args:
+        before: uint8 ``[H, W]``.
+        after: uint8 ``[H, W]``, the next image.
+        points: Corners in the first image, pixels.
+        guess: Where the search begins, ``[N, 2]``, pixels of the next one.
+        tolerance_px: Largest distance of that end.
     """
     # there and back
     options: Any = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}

@@ -127,7 +127,7 @@ class Atlas:
                 )
 
     def slack(self, one: int, other: int) -> float:
-        """How far the worlds of two maps may be rotated against each other, radians."""
+        """Largest rotation of the worlds of two maps against each other, radians."""
         if one == other:
             return 0.0
         # the root map has none
@@ -170,7 +170,7 @@ class Atlas:
         return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)
 
     def _from_root(self, left: int, last: Array, bound_m: float) -> tuple[Array, float]:
-        """Where the root map was left ``[3]``, and how far from there the camera can be now.
+        """Place where the root map was left ``[3]``, and how far from there the camera can be now.
 
         Args:
             left: The map in which the camera was tracked last.

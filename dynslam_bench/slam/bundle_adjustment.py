@@ -150,7 +150,16 @@ def _robust_cost(
     width: float,
     chi2: Array,
 ) -> float:
-    """Cost of all observations by Cauchy's kernel of this squared width; fills `chi2` (inf behind the camera)."""
+    """Cost of all observations by Cauchy's kernel of this squared width; fills `chi2` (inf behind the camera).
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        points: World points ``[Q, 3]``, metres.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        width: Squared width of the kernel, as a chi-square.
+        chi2: ``[N]``, filled.
+    """
     measured = observations.measured
     # Cauchy's cost of a chi-square c at the squared width w: w log(1 + c / w)
     total = 0.0
@@ -172,7 +181,17 @@ def _robust_cost(
 def _fill_point_jacobian(
     pose: Array, du_dx: float, du_dz: float, dv_dy: float, dv_dz: float, dr_dz: float, out: Array
 ) -> None:
-    """Derivatives ``[3, 3]`` of (u, v, right) by the world point: those in the camera frame times the rotation."""
+    """Derivatives ``[3, 3]`` of (u, v, right) by the world point: those in the camera frame times the rotation.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        du_dx: Derivative of u by x in the camera frame, which is that of `right`, too.
+        du_dz: Derivative of u by the depth.
+        dv_dy: Derivative of v by y.
+        dv_dz: Derivative of v by the depth.
+        dr_dz: Derivative of the right coordinate by the depth.
+        out: Filled.
+    """
     # one column a world axis; `right` moves along x as u does
     for m in range(3):
         out[0, m] = du_dx * pose[0, m] + du_dz * pose[2, m]
@@ -192,7 +211,19 @@ def _fill_pose_jacobian(
     dr_dz: float,
     out: Array,
 ) -> None:
-    """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame."""
+    """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame.
+
+    Args:
+        x: The point in the camera frame, metres: to the right.
+        y: Downwards.
+        z: Forwards.
+        du_dx: Derivative of u by x, which is that of `right`, too.
+        du_dz: Derivative of u by z.
+        dv_dy: Derivative of v by y.
+        dv_dz: Derivative of v by z.
+        dr_dz: Derivative of the right coordinate by z.
+        out: Filled.
+    """
     # a rotation about an axis moves the point by the cross product: (0, -z, y), (z, 0, -x), (-y, x, 0)
     # u
     out[0, 0] = du_dx
@@ -258,7 +289,19 @@ def _linearise(
     damping: float,
     chi2: Array,
 ) -> NormalEquations:
-    """The damped Gauss-Newton system, each observation weighted by Cauchy's kernel of this squared width."""
+    """The damped Gauss-Newton system, each observation weighted by Cauchy's kernel of this squared width.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        variable: How many poses, the first ones, are refined.
+        points: World points ``[Q, 3]``.
+        observations: Which pose observes which point, and where; sorted by point.
+        camera: Intrinsics.
+        width: Squared width of the kernel.
+        damping: Share of each diagonal element that is added to it.
+        chi2: Chi-square of each observation ``[N]`` at these poses and points; infinite ones are
+            left out.
+    """
     # the blocks of all poses and points, zero at first
     start = observations.start
     measured = observations.measured
@@ -396,7 +439,16 @@ def _move_points(
     variable: int,
     new_points: Array,
 ) -> None:
-    """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``."""
+    """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``.
+
+    Args:
+        points: World points ``[Q, 3]`` before the step.
+        system: The system whose points were eliminated.
+        twists: Solution for the poses ``[6 P]``.
+        observations: Which pose observes which point.
+        variable: How many poses are refined.
+        new_points: ``[Q, 3]``, filled.
+    """
     start = observations.start
     # each point by itself: its gradient less what the poses' twists change, times the inverse block
     for i in range(points.shape[0]):
@@ -429,7 +481,20 @@ def _step(
     new_poses: Array,
     new_points: Array,
 ) -> bool:
-    """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
+    """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]``.
+        variable: How many poses are refined.
+        points: World points ``[Q, 3]``.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        width: Squared width of the robust kernel.
+        damping: Levenberg-Marquardt's damping.
+        chi2: Chi-square of each observation ``[N]`` before the step.
+        new_poses: ``[P, 4, 4]``, filled.
+        new_points: ``[Q, 3]``, filled.
+    """
     system = _linearise(poses, variable, points, observations, camera, width, damping, chi2)
 
     # the points are many and depend on poses alone: eliminate them, and solve for the poses
@@ -458,7 +523,17 @@ def _adjust(
     iterations: int,
     chi2: Array,
 ) -> tuple[Array, Array, float]:
-    """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`."""
+    """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`.
+
+    Args:
+        poses: World to camera ``[P, 4, 4]`` to start from.
+        variable: How many poses are refined.
+        points: World points ``[Q, 3]`` to start from.
+        observations: Which pose observes which point, and where.
+        camera: Intrinsics.
+        iterations: Steps at most.
+        chi2: Chi-square of each observation ``[N]``, filled.
+    """
     # the kernel is as wide as the residuals are at the start
     _robust_cost(poses, points, observations, camera, 1.0, chi2)
     # an observation with depth has three degrees of freedom: its chi-square is scaled to two
@@ -599,7 +674,15 @@ def full_bundle(slam_map: Map) -> Bundle | None:
 def _bundle(
     slam_map: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int
 ) -> Bundle | None:
-    """The bundle of these keyframes and points (slots); None if no point is observed often enough."""
+    """The bundle of these keyframes and points (slots); None if no point is observed often enough.
+
+    Args:
+        slam_map: The map.
+        variable: Keyframes that are refined.
+        fixed: Keyframes that stay.
+        points: Points that they observe; those with too few views are left out.
+        max_observations: Observations at most; points with the most views come first.
+    """
     # observations of the points, and the number in the bundle of the pose that each is made from
     poses = np.concatenate([variable, fixed])
     pose_number = np.full(slam_map.kf_alive.size, -1, np.int64)

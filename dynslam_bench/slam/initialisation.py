@@ -287,7 +287,14 @@ def distinct_motions(motions: Sequence[TwoViewMotion]) -> list[TwoViewMotion]:
 def _homography(
     xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[list[Array], NDArray[np.bool_]]:
-    """The motions of the homography of most matches, and which matches fit it in both images."""
+    """The motions of the homography of most matches, and which matches fit it in both images.
+
+    Args:
+        xy_first: Pixels ``[N, 2]`` of the first view.
+        xy_second: Pixels ``[N, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[N]``.
+        camera: Intrinsics without distortion.
+    """
     # RANSAC; the limit is for a standard deviation of one pixel
     limit = np.sqrt(CHI2_POINT)
     model, _ = cv2.findHomography(
@@ -316,7 +323,14 @@ def _homography(
 def _essential(
     xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[list[Array], NDArray[np.bool_]]:
-    """The motions of the essential matrix of most matches, and which matches fit it in both images."""
+    """The motions of the essential matrix of most matches, and which matches fit it in both images.
+
+    Args:
+        xy_first: Pixels ``[N, 2]`` of the first view.
+        xy_second: Pixels ``[N, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[N]``.
+        camera: Intrinsics without distortion.
+    """
     # RANSAC; the limit is for a standard deviation of one pixel
     limit = np.sqrt(CHI2_LINE)
     model, _ = cv2.findEssentialMat(
@@ -355,7 +369,15 @@ def _pose(rotation: Any, translation: Any) -> Array:
 def _triangulated(
     T_second_first: Array, xy_first: Array, xy_second: Array, info: Array, camera: Camera
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Points ``[M, 3]`` in the first camera's frame, and which of them lie before both cameras and project back."""
+    """Points ``[M, 3]`` in the first camera's frame, and which of them lie before both cameras and project back.
+
+    Args:
+        T_second_first: Motion ``[4, 4]`` between the views.
+        xy_first: Pixels ``[M, 2]`` of the first view.
+        xy_second: Pixels ``[M, 2]`` of the second view.
+        info: Inverse variances of the pixels ``[M]``.
+        camera: Intrinsics without distortion.
+    """
     # linear triangulation; points at infinity become 0, which is not good below
     projections = camera.matrix @ np.eye(3, 4), camera.matrix @ T_second_first[:3]
     homogeneous = cv2.triangulatePoints(*projections, xy_first.T, xy_second.T).T
@@ -395,7 +417,16 @@ def _adjusted(
     points: Array,
     camera: Camera,
 ) -> TwoViewMotion:
-    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`."""
+    """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`.
+
+    Args:
+        first: The first view, whose pose is the identity.
+        later: Further views, the newest last.
+        poses: Their poses ``[V, 4, 4]``, first view to camera, to start from.
+        matches: Features of the first view and of the newest one, ``[M, 2]``.
+        points: Their points ``[M, 3]`` in the first camera's frame.
+        camera: Intrinsics without distortion.
+    """
     # observations of the points in the first view (number 0) and in the later ones
     count = len(later)
     point_of_feature = np.full(len(first), -1, np.int64)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.features.matching import (
     FAR,
     CellGrid,
@@ -457,7 +457,7 @@ class KeyframePolicy:
 
 
 def established_points(slam_map: Map, keyframe: int) -> int:
-    """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
+    """Number of a keyframe's points that `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
     points = slam_map.kf_point[keyframe]
     # keyframes of the submap: a young one has fewer than `ESTABLISHED`
     young = np.count_nonzero(slam_map.kf_alive & (slam_map.kf_map == slam_map.kf_map[keyframe]))
@@ -512,6 +512,37 @@ def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
         for k in range(3):
             t[i] -= r[i, k] * pose_a[k, 3]
     return r, t
+
+
+@inlined
+def _depths_fit(depth_a: float, depth_b: float, measured_b: float) -> bool:
+    """Whether a triangulated point lies before both cameras, not too far away, and where camera b measured it.
+
+    Args:
+        depth_a: Its depth in camera a, metres.
+        depth_b: Its depth in camera b.
+        measured_b: Depth that was measured at b's feature, 0 missing.
+    """
+    if depth_a < MIN_TRIANGULATED_DEPTH or depth_b < MIN_TRIANGULATED_DEPTH:
+        return False
+    if depth_a > MAX_TRIANGULATED_DEPTH:
+        return False
+    return not (measured_b > 0.0 and abs(depth_b - measured_b) > DEPTH_TOLERANCE * measured_b)
+
+
+@inlined
+def _scales_fit(distance_a: float, distance_b: float, scale_a: float, scale_b: float) -> bool:
+    """Whether the octaves of two features agree with a point's distances: nearer means larger, at a coarser octave.
+
+    Args:
+        distance_a: Distance of the point from camera a.
+        distance_b: Distance of the point from camera b.
+        scale_a: Scale of the octave of a's feature, 1 for the finest.
+        scale_b: Scale of the octave of b's feature.
+    """
+    ratio = distance_a / distance_b
+    expected = scale_b / scale_a
+    return not (ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected)
 
 
 @kernel
@@ -597,29 +628,19 @@ def _triangulate(
             else:
                 continue
 
-            # the point must lie in front of both cameras, and where b measured it
+            # the point must fit both features
             depth_b = ray_z * depth_a + t[2]
-            measured_b = view_b.z[b]
-            if (
-                depth_a < MIN_TRIANGULATED_DEPTH
-                or depth_b < MIN_TRIANGULATED_DEPTH
-                or depth_a > MAX_TRIANGULATED_DEPTH
-                or (measured_b > 0.0 and abs(depth_b - measured_b) > DEPTH_TOLERANCE * measured_b)
-            ):
+            if not _depths_fit(depth_a, depth_b, view_b.z[b]):
                 continue
-
-            # its projection must fit b's feature
             error_x = (ray_x * depth_a + t[0]) / depth_b - bx[j]
             error_y = (ray_y * depth_a + t[1]) / depth_b - by[j]
             if error_x * error_x + error_y * error_y > CHI2_POINT * sigma * sigma:
                 continue
-
-            # the nearer view shows the patch larger, hence at a coarser octave
-            ratio = (depth_a * np.sqrt(x * x + y * y + 1.0)) / (
-                depth_b * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
-            )
-            expected = scales[view_b.octave[b]] / scales[view_a.octave[a]]
-            if ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected:
+            distance_a = depth_a * np.sqrt(x * x + y * y + 1.0)
+            distance_b = depth_b * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
+            if not _scales_fit(
+                distance_a, distance_b, scales[view_a.octave[a]], scales[view_b.octave[b]]
+            ):
                 continue
             best_distance[i] = bits
             match[i] = j

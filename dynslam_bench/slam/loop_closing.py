@@ -133,7 +133,7 @@ class Correction:
         return Correction(self.T_cam_now, self.T_cam_before, 1 / self.scale)
 
     def moved(self, at: Array) -> Array:
-        """Where a place ``[3]`` near the keyframe is after the correction, ``[3]``."""
+        """Move a place ``[3]`` near the keyframe as the correction does, ``[3]``."""
         # in the camera frame, in the new unit; then by the new pose
         local = self.scale * se3.transform(self.T_cam_before, at[None])
         return np.asarray(se3.transform(se3.inverse(self.T_cam_now), local)[0])
@@ -364,7 +364,14 @@ class LoopCloser:
     def _verified_candidate(
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
-        """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
+        """The loop to a candidate, if the points around it explain enough and drift explains the correction.
+
+        Args:
+            slot: The newest keyframe.
+            candidate: The keyframe whose place it may show.
+            observations: Features of the newest keyframe.
+            rng: Draws RANSAC's samples.
+        """
         # the pose by the points around the candidate
         s = self.settings.loop_closing
         tracking = self.settings.tracking
@@ -607,7 +614,14 @@ class LoopCloser:
         return dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
-        """The edge between two keyframes by the pose of the first and one of the other, both world to camera."""
+        """The edge between two keyframes by the pose of the first and one of the other, both world to camera.
+
+        Args:
+            one: Slot of the first keyframe.
+            other: Slot of the other.
+            pose_of_other: World to camera ``[4, 4]``, as the edge has it.
+            weight: Information weight.
+        """
         id_one, id_other = self.map.kf_id[[one, other]].tolist()
         return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.map.kf_pose[one]), weight)
 
@@ -782,7 +796,15 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
 def _edge_errors(
     poses: Array, one: Slots, other: Slots, T_one_other: Array, sigmas: Array
 ) -> Array:
-    """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
+    """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas.
+
+    Args:
+        poses: World to camera ``[N, 4, 4]``.
+        one: Row of the pose at the first end of each edge ``[E]``.
+        other: Row of the pose at the other end ``[E]``.
+        T_one_other: Measured poses ``[E, 4, 4]`` from the other camera's frame to the first one's.
+        sigmas: Standard deviations ``[E, 6]``.
+    """
     # identity if T_other_one of the poses is the measured one
     return se3.log(poses[other] @ se3.inverse(poses[one]) @ T_one_other) / sigmas
 
@@ -790,7 +812,16 @@ def _edge_errors(
 def _graph_step(
     poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float
 ) -> Array:
-    """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
+    """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero.
+
+    Args:
+        poses: World to camera ``[N, 4, 4]``.
+        one: Row of the pose at the first end of each edge ``[E]``.
+        other: Row of the pose at the other end ``[E]``.
+        error: Errors ``[E, 6]`` of the edges, in their sigmas.
+        sigmas: Standard deviations ``[E, 6]``.
+        damping: Levenberg-Marquardt's damping, relative to the diagonal.
+    """
     # how each error follows a twist on the left of either pose: blocks [6, 6]
     jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]

@@ -251,7 +251,15 @@ class Map:
         stamp: float,
         submap: int = 0,
     ) -> int:
-        """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
+        """Store a frame's features as a keyframe that observes no points yet; returns its slot.
+
+        Args:
+            observations: The frame's features.
+            T_cam_world: Its pose ``[4, 4]``.
+            frame: Its index.
+            stamp: Its timestamp, seconds.
+            submap: Number of the submap that it belongs to.
+        """
         # the keyframe: number, map, frame, pose
         n = len(observations)
         slot = self._free_keyframe_slot(*observations.descriptors.shape)
@@ -366,7 +374,14 @@ class Map:
     def add_points(
         self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots
     ) -> Slots:
-        """New points ``[N, 3]`` that features of a keyframe observe; returns their slots."""
+        """New points ``[N, 3]`` that features of a keyframe observe; returns their slots.
+
+        Args:
+            position: World points, metres.
+            rgb: Their colours, uint8 ``[N, 3]``.
+            keyframe: Slot of the keyframe.
+            features: Its features ``[N]``, which observe nothing yet.
+        """
         # freed slots first, then new ones behind the others
         n = len(position)
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
@@ -665,7 +680,17 @@ def _refresh(
     keyframes: KeyframeViews,
     scales: Array,
 ) -> None:
-    """Renew descriptor, viewing direction and scale range of the points from their observations."""
+    """Renew descriptor, viewing direction and scale range of the points from their observations.
+
+    Args:
+        points: Slots of the points.
+        views: Positions, viewing directions and scale ranges of all points; the latter two are
+            changed.
+        descriptors: uint64 ``[M, W]`` of all points, changed.
+        tables: Which features of which keyframes observe them.
+        keyframes: Descriptors, octaves and centres of all keyframes.
+        scales: Scale of each octave, 1 for the finest.
+    """
     obs_kf = tables.obs_kf
     obs_ft = tables.obs_ft
     for i in range(points.shape[0]):
@@ -726,10 +751,20 @@ def _project(
     scale_factor: float,
     levels: int,
 ) -> tuple[int, Slots, Array, Array, Slots, Array]:
-    """How many of the candidate points the camera should see, and these, see `VisiblePoints`, in longer arrays.
+    """Count the candidate points that the camera should see, and list them, see `VisiblePoints`, in longer arrays.
 
     They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
     side that they were seen from before (ORB-SLAM2's ``isInFrustum``).
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        candidates: Slots of the points.
+        views: Positions, viewing directions and scale ranges of all points.
+        camera: Intrinsics without distortion.
+        width: Width of the image, pixels.
+        height: Height of the image, pixels.
+        scale_factor: Ratio of consecutive pyramid levels.
+        levels: Number of pyramid levels.
     """
     n = candidates.shape[0]
     # results, as long as if all candidates were visible
@@ -790,7 +825,14 @@ def _project(
 def _redundancy(
     keyframe: int, close: NDArray[np.bool_], kf_octave: Any, tables: ObservationTables
 ) -> tuple[int, int]:
-    """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
+    """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser.
+
+    Args:
+        keyframe: Slot of the keyframe.
+        close: bool ``[F]``, features whose depth is close.
+        kf_octave: Octaves ``[S, F]`` of all keyframes' features.
+        tables: Which features of which keyframes observe which points.
+    """
     obs_kf = tables.obs_kf
     obs_ft = tables.obs_ft
     total = 0

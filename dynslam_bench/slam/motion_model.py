@@ -1,4 +1,4 @@
-"""How a hand-held camera moves: white-noise acceleration, as a filter while tracking and a smoother afterwards.
+"""Model of a hand-held camera's motion: white-noise acceleration, as a filter while tracking and a smoother afterwards.
 
 State of the filter: position p and velocity v in the world, orientation R_cam_world and angular
 velocity w in the camera frame; accelerations are white noise. The measurement is the pose that the
@@ -211,7 +211,14 @@ def smooth(
 def _smooth_segment(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
-    """`smooth` within a part without gaps."""
+    """`smooth` within a part without gaps.
+
+    Args:
+        stamps: Seconds ``[N]``, ascending.
+        poses: Measured world-to-camera poses ``[N, 4, 4]``.
+        covariances: Their covariances ``[N, 6, 6]``.
+        settings: Standard deviations of the accelerations.
+    """
     # forwards: filter, and keep each prediction
     state = MotionState.at(poses[0], covariances[0])
     filtered = [state]

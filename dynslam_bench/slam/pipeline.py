@@ -250,7 +250,14 @@ class SlamPipeline:
         depth: NDArray[np.float32],
         clock: StageClock,
     ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
-        """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none."""
+        """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none.
+
+        Args:
+            frame: The frame.
+            gray: uint8 ``[H, W]``, its grey levels.
+            depth: float32 ``[H, W]`` metres, 0 missing.
+            clock: Times the stage.
+        """
         if self._mask_scheduler is None:
             return None, None
         # masks now, or those of the last segmented frame moved to this one
@@ -584,7 +591,7 @@ def flow_to_previous(
 
 
 def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32]:
-    """Where the motion model expects this frame's keypoints in the previous image.
+    """Places in the previous image where the motion model expects this frame's keypoints.
 
     Args:
         frame: The current frame.

@@ -167,6 +167,16 @@ def _linearise(
     """Fill the Gauss-Newton system ``h x = g`` ``[6, 6]``, ``[6]`` of the active points; returns the cost.
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        points: World points ``[N, 3]``, metres.
+        measured: Where the image shows them.
+        active: bool ``[N]``, points that count.
+        width: Squared width of Cauchy's kernel; 0 for Huber's.
+        camera: Intrinsics.
+        h: Filled with the Gauss-Newton matrix, lower triangle.
+        g: Filled with the gradient.
     """
     h[:] = 0.0
     g[:] = 0.0
@@ -267,7 +277,17 @@ def observation_chi2(
     info_right: float,
     camera: Intrinsics,
 ) -> tuple[float, float]:
-    """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
+    """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        point: World point ``[3]``, metres.
+        uv: Undistorted pixel ``[2]`` that shows it.
+        right: Its right coordinate; ignored where `info_right` is 0.
+        info: Inverse variance of the pixel, 1/px^2.
+        info_right: Inverse variance of the right coordinate, 0 without depth.
+        camera: Intrinsics.
+    """
     # the point in the camera frame
     x, y, z = transform_point(pose, point)
     if z < NEAR_M:
@@ -296,6 +316,14 @@ def _classify(
     """Fill which observations fit, ``[N]``, and their reprojection errors ``[N]`` in standard deviations.
 
     Returns how many fit.
+
+    Args:
+        pose: World to camera ``[4, 4]``.
+        points: World points ``[N, 3]``.
+        measured: Where the image shows them.
+        camera: Intrinsics.
+        inlier: Filled.
+        error: Filled; infinite behind the camera.
     """
     count = 0
     # chi-square tests at 95 %, with two degrees of freedom or, with depth, three
@@ -324,7 +352,16 @@ def _optimise(
     rounds: int,
     iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:
-    """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``."""
+    """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``.
+
+    Args:
+        pose: World to camera ``[4, 4]`` to start from.
+        points: World points ``[N, 3]``.
+        measured: Where the image shows them.
+        camera: Intrinsics.
+        rounds: Optimisations, each followed by a new sorting into inliers and outliers.
+        iterations: Steps a round at most.
+    """
     # every point is an inlier at first
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))

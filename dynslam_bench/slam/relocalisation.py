@@ -324,7 +324,16 @@ def _ransac_place(
     rng: np.random.Generator,
     min_inliers: int,
 ) -> InitialPose | None:
-    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
+    """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it.
+
+    Args:
+        slam_map: The map.
+        keyframe: Slot of the keyframe.
+        observations: The frame's features.
+        matches: Its matches with the keyframe's map points.
+        rng: Draws the samples.
+        min_inliers: Inliers that are needed.
+    """
     feature = matches.feature
     # reprojection errors by the features' own information
     ransac = ransac_pose(
@@ -460,7 +469,7 @@ def recognise_place(
 def pose_uncertainty(
     slam_map: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
 ) -> float:
-    """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
+    """Uncertainty of the pose by the matches, e.g. those on one distant poster; up to 1 is precise enough.
 
     The number of matches says nothing of that: errors of the map are common to all of them. So they
     have to be well spread, and any half has to give the pose, so that a few far off the others do
@@ -712,7 +721,7 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        # a well-tracked camera that sees something else at once was put elsewhere
+        # a well-tracked camera that sees something else at once was kidnapped
         points = int((last.point >= 0).sum())
         self._kidnapped = self.rotation is None and textured and points >= KIDNAP_POINTS
 

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageOps
 
 from dynslam_bench.contracts.tracker import MapOutputs
 from dynslam_bench.core import write_atomic
+from dynslam_bench.core.number_text import length_text, mm
 from dynslam_bench.geometry import Trajectory, se3
 
 Array = NDArray[np.float64]
@@ -77,7 +78,7 @@ def write_run_figure(
     # map and track are drawn in the plane in which the map spreads most
     plane = _main_plane(outputs.positions if len(outputs.positions) >= 3 else track.positions)
     length = f"{track.path_length_m if len(track) else 0.0:.2f} m"
-    error = "" if ate_m is None else f", ATE {1000 * ate_m:.1f} mm"
+    error = "" if ate_m is None else f", ATE {mm(ate_m)} mm"
     lines = [("track", BLUE), ("start", GREEN), ("end", RED)]
     if ground_truth is not None:
         lines.append(("truth", GREY))
@@ -179,7 +180,7 @@ class _Axes:
         end = 12 + int(bar * self._scale)
         y = PANEL[1] - 14
         self.draw.line((12, y, end, y), INK, 2)
-        self.draw.text((end + 6, y - 6), f"{bar:g} m", INK, font_size=11)
+        self.draw.text((end + 6, y - 6), length_text(bar), INK, font_size=11)
 
     def pixels(self, xy: Array) -> NDArray[np.int64]:
         """Pixels ``[N, 2]`` of plane coordinates ``[N, 2]``, metres; y points up."""

@@ -61,7 +61,7 @@ class TrackingSettings(Settings):
 
 
 class KeyframeSettings(Settings):
-    """When a frame becomes a keyframe, and when a keyframe is redundant."""
+    """Settings of when a frame becomes a keyframe, and when a keyframe is redundant."""
 
     schedule: Literal["rule", "every", "none"] = tunable(
         "rule", online=True, tuned=False, meaning="tracked frames that become keyframes"
@@ -292,7 +292,7 @@ class TwoViewSettings(Settings):
 
 
 class MonocularKeyframeSettings(KeyframeSettings):
-    """When a frame becomes a keyframe: earlier than with depth, since points come from keyframes alone."""
+    """Settings of when a frame becomes a keyframe: earlier than with depth, since points come from keyframes alone."""
 
     max_gap: int = Field(30, description=NO_DEPTH)
     tracked_share: float = tunable(

@@ -331,7 +331,15 @@ def solve(
     *,
     rounds: int = 4,
 ) -> PoseEstimate:
-    """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one."""
+    """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one.
+
+    Args:
+        camera: Intrinsics without distortion.
+        observations: The frame's features.
+        matches: Which of them show which world points.
+        T_cam_world: Pose to start from.
+        rounds: Optimisations, each followed by a new sorting into inliers and outliers.
+    """
     measured = observations.measurements(matches.feature)
     return optimise_pose(T_cam_world, matches.position, measured, camera, rounds=rounds)
 
@@ -358,7 +366,15 @@ class MapFit:
 def fit_pose(
     camera: Camera, observations: Observations, matches: Matches, T_cam_world: Array, in_view: Slots
 ) -> MapFit:
-    """Fit the pose to matches with the local map."""
+    """Fit the pose to matches with the local map.
+
+    Args:
+        camera: Intrinsics without distortion.
+        observations: The frame's features.
+        matches: Which of them show which points.
+        T_cam_world: Pose ``[4, 4]`` to start from.
+        in_view: Slots of the map points that should be in view.
+    """
     # points that only the last frame's depth gives are no observations of the map
     estimate = solve(camera, observations, matches, T_cam_world)
     inliers = estimate.inliers & (matches.point >= 0)

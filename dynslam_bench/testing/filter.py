@@ -247,6 +247,7 @@ def _repeated(
 
 
 def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
+    """A frame of which the flow has lost every keypoint."""
     if state.flow is None:
         return frame, state
     lost = np.full_like(state.flow.xy, np.nan)
@@ -255,6 +256,7 @@ def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, 
 
 
 def _all_masked(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
+    """A frame with one person whose mask covers the image."""
     height, width = frame.depth.shape
     box = np.array([[0, 0, width, height]], np.float32)
     whole = Instances(np.ones((1, height, width), bool), box, ("person",), np.ones(1, np.float32))

@@ -84,7 +84,12 @@ def features_report(
 def _on_hard_images(
     frame: Frame, results: Callable[[Frame], object]
 ) -> dict[str, Callable[[], object]]:
-    """The checks of results on images that have nothing to find."""
+    """The checks on images that have nothing to find, by name.
+
+    Args:
+        frame: A usual frame, from which these are made.
+        results: Checks what a segmenter, extractor or flow gives for a frame.
+    """
     return {f"{name} image": partial(results, hard) for name, hard in hard_frames(frame).items()}
 
 
@@ -302,7 +307,7 @@ def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
 def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
-    """Two flows with one seed give the same; rows that are not valid may differ."""
+    """Check that two flows with one seed give the same; rows that are not valid may differ."""
     # only valid rows are compared: the others mean nothing
     flows = construct(), construct()
     a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)

@@ -57,7 +57,7 @@ def examine() -> list[Finding]:
 
 
 def _recordings() -> Finding:
-    """How many recorded sequences there are."""
+    """Number of recorded sequences."""
     here = [summary["id"] for summary in summaries() if summary["here"]]
     count = sum(not name.startswith("synthetic/") for name in here)
     state = f"{count} in {find_data_root()}"

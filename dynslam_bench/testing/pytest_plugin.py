@@ -75,7 +75,7 @@ class ConformanceItem(pytest.Item):
             pytest.fail(self.check.message, pytrace=False)
 
     def reportinfo(self) -> tuple[str, None, str]:
-        """Where the item stands, for pytest's output."""
+        """Location of the item, for pytest's output."""
         return "dynslam-bench", None, f"check of {self.name}"
 
 

@@ -1,4 +1,4 @@
-"""How conformance checks are run and reported."""
+"""Runs and reports of conformance checks."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ def _digest(sequence: Sequence) -> None:
 
 
 def _pickling(sequence: Sequence) -> None:
-    """A pickled copy is the same sequence: workers get it so."""
+    """Check that a pickled copy is the same sequence: workers get it so."""
     copy = pickle.loads(pickle.dumps(sequence))
     require(
         len(copy) == len(sequence) and copy.digest() == sequence.digest(),

@@ -190,7 +190,8 @@ def _verdict_cell(board: Board, standing: Standing | None, cell: TableCell) -> T
     tip = "" if standing.p_value is None else f"p {standing.p_value:.2g}, Holm-corrected"
     if standing.verdict == "cannot tell":
         more = more_sequences(board, standing.key)
-        settle = f"about {more} more sequences would settle it" if more else ""
+        plural = "" if more == 1 else "s"
+        settle = f"about {more} more sequence{plural} would settle it" if more else ""
         return replace(cell, small="; ".join(filter(None, [settle, small])), tip=tip)
     text = f"{cell.text} {standing.scope}".strip()
     return replace(cell, text=text, small=small, tip=tip)

@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
-from dynslam_bench.reports.html.still import still
+from dynslam_bench.reports.html.static_chart import static_chart
 from dynslam_bench.reports.tables.table import Table
 
 ASSETS = "assets"
@@ -96,7 +96,7 @@ def _templates() -> Environment:
         "breakable": _breakable,
         "script": to_script,
         "figure": figure_json,
-        "still": still,
+        "static_chart": static_chart,
     }
     return environment
 

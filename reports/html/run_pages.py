@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
 from dynslam_bench.core.module_graph import PLUMBING, module_graph
+from dynslam_bench.core.number_text import mm, significant_text
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.evaluation.verdicts import CATASTROPHE, FLOOR_M
@@ -28,7 +29,6 @@ from dynslam_bench.reports.html.page import read_remark, write_changed, write_si
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
 from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
-from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE, read_snapshots
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
@@ -53,7 +53,7 @@ WORST = 6
 _APART = 15
 """Frames between two of these at least."""
 _LOG_BYTES = 20_000
-"""How much of the end of a log a page shows."""
+"""Bytes of the end of a log that a page shows."""
 _NO_STAGES = ("total_s", "processor_s", "read_s")
 """Times of a frame that are no stage of it: the figure stacks stages."""
 
@@ -311,7 +311,7 @@ Level = Literal["red", "amber", "green"]
 def run_summary(
     row: RunRow, frames: RunFrames, least: LeastError | None = None
 ) -> tuple[Level, str]:
-    """How a run ended, and why, in one sentence, with its level.
+    """Sentence on how a run ended, and why, with its level.
 
     Red: it failed, or a camera that does not move has no larger error. Amber: frames were lost, the
     trajectory is probably faulty, or the error is more than `CATASTROPHE` times the least on the
@@ -341,12 +341,14 @@ def run_summary(
         return "amber", f"{words}. {loss}" if loss else words
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
+    if row.coverage is None:
+        return "amber" if far_off else "green", f"{row.poses_words}: {error}{far_off}"
     tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
     return "amber" if far_off else "green", f"{tracked}: {error}{far_off}"
 
 
 def _far_off_words(score_m: float | None, least: LeastError | None) -> str:
-    """How many times the least error a run has, where that is more than `CATASTROPHE`; else empty."""
+    """Words on how many times the least error a run has, where that is more than `CATASTROPHE`; else empty."""
     if score_m is None or least is None:
         return ""
     ratio = max(score_m, FLOOR_M) / max(least.error_m, FLOOR_M)
@@ -359,7 +361,7 @@ def _far_off_words(score_m: float | None, least: LeastError | None) -> str:
 
 
 def _failure_words(row: RunRow, frames: RunFrames) -> str:
-    """How a failed run ended, and why."""
+    """Sentence on how a failed run ended, and why."""
     reason = f": {row.reason}" if row.reason else ""
     if row.status == "ok":
         return f"Not evaluated{reason}"
@@ -372,7 +374,7 @@ def _failure_words(row: RunRow, frames: RunFrames) -> str:
 
 
 def _loss_words(row: RunRow, frames: RunFrames) -> str:
-    """When tracking was lost first, and what the frame showed; empty where it was not."""
+    """Sentence on when tracking was lost first, and what the frame showed; empty where it was not."""
     lost = np.flatnonzero(frames.columns.get("state", np.array([], str)) == "lost")
     if not len(lost):
         return ""
@@ -419,7 +421,7 @@ def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
         (ate_name, ate),
         ("of a static camera's", of_static),
         (rpe_name, rpe_text),
-        ("coverage", coverage_text(row.coverage)),
+        ("coverage", coverage_text(row.coverage, row.truth_share)),
         ("time of a frame", time),
         ("memory", memory),
     ]
@@ -434,7 +436,7 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
     words = [
         f"{row.label} on {row.sequence.id}{part}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm",
         "lost frames held at the last pose",
-        f"coverage {coverage_text(row.coverage)}",
+        f"coverage {coverage_text(row.coverage, row.truth_share)}",
         protocol.describe(),
     ]
     if row.git:
@@ -450,6 +452,10 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
         ("ATE of the final trajectory", row.final_ate_m, 1000, " mm"),
         ("false motion, farthest", row.metrics.get("false_motion_max_m"), 1000, " mm"),
         ("false motion, path", row.metrics.get("false_motion_path_m"), 1000, " mm"),
+        ("NEES / 6 of the covariances, one frame", row.metrics.get("nees_1f_mean"), 1, ""),
+        ("within the 95 % ellipsoid, one frame", row.metrics.get("within95_1f"), 100, " %"),
+        ("NEES / 6 of the covariances, one second", row.metrics.get("nees_1s_mean"), 1, ""),
+        ("within the 95 % ellipsoid, one second", row.metrics.get("within95_1s"), 100, " %"),
         ("real time", row.real_time_factor, 1, " ×"),
         ("keyframes", record.keyframes, 1, ""),
         ("map points", record.map_points, 1, ""),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence
+from dynslam_bench.core.number_text import mm
+from dynslam_bench.reports.model.board import OVERALL, Board, TrackerOnSequence, mean_of
 from dynslam_bench.reports.model.row import SEEN, RunRow
-from dynslam_bench.reports.tables.table import mm
 from dynslam_bench.runs.rows import part_words
 
 MEANINGS = {
@@ -23,6 +24,10 @@ MEANINGS = {
     "rendered": "rendered scenes",
 }
 """Categories in everyday words."""
+NEARLY_ALL = 0.95
+"""Share of the ground truth's time from which nothing is said of it: it often goes on behind the last image."""
+_MOST_NAMED = 4
+"""Trackers that a sentence on failures names, those with the most first."""
 _BEST_NAMED = 2
 """Ranked trackers that an answer names, from the best on, beside the reference."""
 
@@ -135,10 +140,20 @@ def _words(board: Board, key: str, names: Sequence[str]) -> str:
         remarks.append("final trajectory")
     if error.sequences < error.asked:
         remarks.append(f"on {error.sequences}")
+    shares = [row.truth_share for name in names for row in _rows(board, key, name)]
+    share = mean_of(shares)
+    if share is not None and share < NEARLY_ALL:
+        remarks.append(f"{100 * share:.0f} % of the time")
     if error.lost:
         remarks.append(f"lost {error.lost}")
     behind = f" ({', '.join(remarks)})" if remarks else ""
     return f"{board.names[key]} {mm(error.median_m)} mm{behind}"
+
+
+def _rows(board: Board, key: str, name: str) -> list[RunRow]:
+    """The runs of a tracker on a sequence."""
+    cell = board.cells[key].get(name)
+    return [] if cell is None else list(cell.rows)
 
 
 def limits(board: Board) -> str:
@@ -151,10 +166,21 @@ def limits(board: Board) -> str:
         sentences.append("One run each: how far repeats lie apart is not known.")
     if any(row.seen_in_training for row in rows):
         sentences.append(f"{SEEN} Masks of a network that was trained on the very scene.")
-    failed = sum(row.failed for row in rows)
-    if failed:
-        sentences.append(f"{failed} of {len(rows)} runs failed, and count as not moving, or worse.")
-    return " ".join(sentences)
+    sentences.append(_failures_words(board))
+    return " ".join(filter(None, sentences))
+
+
+def _failures_words(board: Board) -> str:
+    """How many runs failed, and of which trackers; empty for none."""
+    failed = Counter(board.names[row.variant_key] for row in board.rows if row.failed)
+    if not failed:
+        return ""
+    named = [f"{name} {count}" for name, count in failed.most_common(_MOST_NAMED)]
+    if len(failed) > _MOST_NAMED:
+        named.append(f"{len(failed) - _MOST_NAMED} more trackers")
+    verb = "counts" if failed.total() == 1 else "count"
+    words = f"{failed.total()} of {len(board.rows)} runs failed ({', '.join(named)})"
+    return f"{words} and {verb} as not moving, or worse."
 
 
 def _kind_of_data(rows: Iterable[RunRow]) -> str:

@@ -325,7 +325,7 @@ class Board:
 
             ``Float64`` columns:
 
-            - coverage and epipolar_skipped: shares, 0 to 1;
+            - coverage, truth_share (of imports whose frames are not known) and epipolar_skipped: shares, 0 to 1;
             - score_m: the ATE in metres that ranks: lost frames held, failures as a static camera
                 or worse;
             - hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m: metres;
@@ -626,7 +626,7 @@ MOST_FURTHER = 500
 
 
 def more_sequences(board: Board, key: str) -> int | None:
-    """How many further sequences would tell a tracker from the reference, if the truth is what is measured here.
+    """Number of further sequences that would tell a tracker from the reference, if the truth is what is measured here.
 
     Returns:
         None where that cannot be said: without a reference or a scatter, or for more than
@@ -634,6 +634,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     """
     if board.reference is None or len(board.common) < FEWEST:
         return None
+    # log ratios of the errors on sequences that both have tracked
     logs = common_logs(board, [key, board.reference])
     lost = board.lost(key) | board.lost(board.reference)
     is_lost = np.array([name in lost for name in board.common], dtype=bool)
@@ -641,6 +642,7 @@ def more_sequences(board: Board, key: str) -> int | None:
     differences = differences[~is_lost & np.isfinite(differences)]
     if len(differences) < FEWEST:
         return None
+    # the number of sequences that shows the measured gain at this scatter
     spread = float(differences.std(ddof=1))
     gain = 1.0 - math.exp(-abs(float(differences.mean())))
     n_tests = max(len(board.ranked) - 1, 1)
@@ -868,7 +870,7 @@ def _each_once(board: Board, names: Sequence[str]) -> list[str]:
 
 
 def _most_cells(sequences: Sequence[set[str]]) -> int:
-    """How many trackers to rank so that trackers times common sequences is largest: several, where that is possible.
+    """Number of trackers to rank so that trackers times common sequences is largest: several, where that is possible.
 
     Args:
         sequences: The sequences of each tracker, most first.
@@ -938,7 +940,7 @@ class TrackerOnSequence:
 
     @cached_property
     def ending(self) -> str:
-        """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
+        """Words on how the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
         if len(endings) > 1:
             return f"{self.failed} failed: {'; '.join(endings)}"
@@ -957,7 +959,7 @@ def make_cell(rows: Sequence[RunRow]) -> TrackerOnSequence:
 
 
 def _result_of(row: RunRow) -> tuple[object, ...]:
-    """How a run ended, and all its errors; equal for copies."""
+    """Status and all errors of a run; equal for copies."""
     errors = (row.score_m, row.final_ate_m, *sorted(row.metrics.items()))
     return (row.status, row.n_processed, row.coverage, *errors)
 
@@ -969,7 +971,7 @@ def timed(runs: Sequence[RunRow]) -> list[RunRow]:
 
 
 def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
-    """The runs whose times count: of those with frame times the ones on one computer.
+    """The runs whose times are compared: those with frame times that one computer has made.
 
     Args:
         runs: Some runs.
@@ -979,6 +981,11 @@ def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
     if computer in by_computer:
         return by_computer[computer]
     return max(by_computer.values(), key=lambda rows: (len(rows), rows[0].computer), default=[])
+
+
+def mean_coverage(rows: Sequence[RunRow]) -> tuple[float | None, float | None]:
+    """Mean coverage of runs, and the mean share of the truth's time of those whose frames are not known."""
+    return mean_of(row.coverage for row in rows), mean_of(row.truth_share for row in rows)
 
 
 def mean_of(values: Iterable[float | None]) -> float | None:
@@ -1098,6 +1105,7 @@ _COLUMNS = {
     ),
     "Float64": (
         "coverage",
+        "truth_share",
         "score_m",
         "hold_last_pose_ate_m",
         "final_ate_m",

@@ -31,7 +31,7 @@ ProgramComponent = tuple[str, str]
 Repeat = tuple[str, tuple[int, int, int, str]]
 """A column and the repeat in it, see `RunRow.sequence_key` and `RunRow.repeat_key`."""
 Result = tuple[str, tuple[tuple[str, str], ...]]
-"""How a run ended, and the checksums of its trajectories."""
+"""Status of a run that ended, and the checksums of its trajectories."""
 Preference = tuple[bool, bool, bool, float, str]
 
 
@@ -97,7 +97,7 @@ class ProgramRow:
         return {part: sorted(values) for part, values in sorted(of_part.items())}
 
     def outcomes(self, other: "ProgramRow") -> Iterator["RunAgreement"]:
-        """How each run compares with that of another row, of all runs that both have; copies are left out.
+        """Agreement of each run with that of another row, of all runs that both have; copies are left out.
 
         Copies are runs that differ in their seed only and have one result: they count once, as in a
         cell of a table.
@@ -139,12 +139,17 @@ class ProgramRow:
         return equal >= FEWEST_EQUAL
 
     def shared_results(self) -> int:
-        """Results of runs that ended well which several of its programs have; other seeds' copies do not count."""
-        # which programs made each run
+        """Number of different good results of runs that several of the row's programs have made.
+
+        A deterministic tracker gives one result for all seeds: it counts once.
+        """
+        # the programs that made each run
         makers: dict[Repeat, set[int]] = {}
         for at, program in enumerate(self.programs):
             for row in program.rows:
                 makers.setdefault((row.sequence_key, row.repeat_key), set()).add(at)
+
+        # different results, whatever the seed
         shared = set()
         for repeat, programs in makers.items():
             column, (offset, noise, _, _) = repeat
@@ -189,7 +194,7 @@ def _compare_results(
 
 
 class RowAgreement(NamedTuple):
-    """How the results of two rows compare, on the runs that both have; see `RunAgreement`.
+    """Agreement of the results of two rows, on the runs that both have; see `RunAgreement`.
 
     Attributes:
         equal: Runs with equal results.
@@ -355,7 +360,7 @@ def starts_in_future(row: RunRow, now: datetime) -> bool:
 
 
 def _start_of(row: RunRow) -> datetime:
-    """When a run started; the earliest date where its record does not tell."""
+    """Time when a run started; the earliest date where its record does not tell."""
     try:
         start = datetime.fromisoformat(row.started)
     except ValueError:
@@ -471,7 +476,7 @@ def _what_differs(one: ProgramRow, other: ProgramRow) -> str:
 
 
 def _comparison_words(program_row: ProgramRow, ranked: ProgramRow) -> str:
-    """How the results of a row compare with those of the ranked one."""
+    """Words on how the results of a row compare with those of the ranked one."""
     agreement = program_row.compare(ranked)
     # an honest comparison needs common runs, and trackers that repeat their results
     total = agreement.equal + agreement.different
@@ -489,7 +494,7 @@ def _comparison_words(program_row: ProgramRow, ranked: ProgramRow) -> str:
 
 
 def _superseded_words(ranked: ProgramRow, superseded: Sequence[ProgramRow]) -> list[str]:
-    """How the ranked row's results differ from those of the newest program of which all was run again."""
+    """Words on how the ranked row's results differ from those of the newest program of which all was run again."""
     if not (ranked.is_verified and ranked.is_deterministic):
         return []
     for program_row in superseded:
@@ -506,6 +511,6 @@ def _runs(count: int) -> str:
 
 
 def _result_of(row: RunRow) -> Result:
-    """How a run ended, and the checksums of its trajectories."""
+    """Status of a run that ended, and the checksums of its trajectories."""
     checksums = tuple((name, row.files[name]) for name in (FINAL, ONLINE) if name in row.files)
     return row.status, checksums

@@ -54,7 +54,7 @@ HOW = {
     "S": "second-hand: another paper's table or notes",
     "I": "inferred",
 }
-"""How a record is known, to its words."""
+"""Words for the form in which a record is known, by its letter."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def static_camera_errors() -> dict[tuple[str, str], float]:
 
 
 def least_length_s(sequence: str) -> float | None:
-    """How long a published recording lasts at least, in seconds; None where that is not known."""
+    """Least duration of a published recording, in seconds; None where that is not known."""
     frames = _LEAST_FRAMES.get(sequence)
     return None if frames is None else frames / 30.0
 

@@ -18,7 +18,7 @@ from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.layout import TrajectoryKind
-from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
+from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord, coverage_text
 from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.tags import FIXED_CAMERA
@@ -226,9 +226,11 @@ class RunRow(RunRecord):
 
     @property
     def ending(self) -> str:
-        """How a failed run ended, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
+        """End of a failed run, e.g. ``crashed at 20/60`` or ``lost, 12/60 tracked``; empty for any other."""
         if not self.failed:
             return ""
+        if self.status == "lost" and self.coverage is None:
+            return f"lost, {coverage_text(None, self.truth_share)}"
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
         if self.status == "ok":
@@ -488,7 +490,7 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
 
 
 def sequence_options(row: RunRow) -> list[str]:
-    """Its part of the sequence, and the camera that its command named, as options of the command line."""
+    """Options of the command line for the run's part of the sequence, and for the camera that its command named."""
     words = []
     if row.frames is not None:
         frames = ":".join("" if end is None else str(end) for end in row.frames)

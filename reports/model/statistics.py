@@ -33,9 +33,9 @@ Array = NDArray[np.float64]
 Cells = Mapping[str, Mapping[str, Sequence[float]]]
 """Tracker to sequence to the errors of its runs there, in metres."""
 RankingVerdict = Literal["better", "better, but lost", "worse", "cannot tell", "reference", ""]
-"""How a tracker stands to the reference; empty for one that is not ranked."""
+"""Standing of a tracker to the reference; empty for one that is not ranked."""
 Scope = Literal["", "on these families", "beyond these families", "by lost sequences"]
-"""How far a verdict goes, or that losses alone show it; empty where nothing is claimed."""
+"""Scope of a verdict, or that losses alone show it; empty where nothing is claimed."""
 
 FEWEST = 5
 """Sequences below which no interval is given and no two trackers are called different."""

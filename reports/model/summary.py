@@ -49,7 +49,8 @@ def headline(board: Board) -> str:
         return f"{where}{board.reference_name} lost all, so no tracker can be compared with it."
     if not claimed:
         n_worse = sum(standing.verdict == "worse" for standing in ranked)
-        return f"{where}no tracker is shown to be better than {board.reference_name}; {_are(n_worse)} worse."
+        worse = f"; {_are(n_worse)} worse" if n_worse else ""
+        return f"{where}no tracker is shown to be better than {board.reference_name}{worse}."
     return f"{where}{claimed}."
 
 
@@ -106,7 +107,7 @@ def _but_lost_words(board: Board, ranked: list[Standing]) -> str:
 
 
 def explanation(board: Board) -> str:
-    """How to read the board, for a reader without statistics; empty where nothing is ranked."""
+    """Sentences on reading the board, for a reader without statistics; empty where nothing is ranked."""
     if not board.common or not board.ranked:
         return ""
     if len(board.common) < FEWEST:
@@ -232,7 +233,7 @@ def mean_rank_note(board: Board) -> str:
 
 
 def _sequences(board: Board) -> str:
-    """How many sequences the ranking is over, and of which category."""
+    """Words on how many sequences the ranking is over, and of which category."""
     number = len(board.common)
     plural = "sequence" if number == 1 else "sequences"
     if board.category == "loops":

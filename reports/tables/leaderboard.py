@@ -11,6 +11,7 @@ from statistics import median
 import numpy as np
 
 from dynslam_bench.core import label_text
+from dynslam_bench.core.number_text import mm, significant_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE, FLOOR_M
@@ -22,6 +23,7 @@ from dynslam_bench.reports.model.board import (
     TrackerOnSequence,
     TrackerPair,
     compare_pairs,
+    mean_coverage,
     mean_of,
     rank,
     timed,
@@ -36,11 +38,9 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     emphasise,
-    mm,
     number,
     numbers,
     percent,
-    significant_text,
     texts,
 )
 from dynslam_bench.runs.record import coverage_text
@@ -153,7 +153,7 @@ COLUMNS = (
 
 
 def _leaderboard_caption(board: Board, protocol: Protocol, *, has_epipolar: bool) -> str:
-    """How to read the leaderboard: what always holds, then remarks on what this board shows."""
+    """Sentences on reading the leaderboard: what always holds, then remarks on what this board shows."""
     n_failed = sum(row.failed for row in board.rows)
     sentences = [
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
@@ -282,7 +282,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
     runs = board.runs(key)
     ended = [row for row in runs if not row.failed]
     tracker = runs[0].tracker
-    coverage = mean_of(row.coverage for row in runs)
+    coverage, truth_share = mean_coverage(runs)
 
     # the name, marked where a trajectory is probably faulty
     hinted = _hint_counts(runs)
@@ -299,7 +299,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(label, hinted, tip=tracker.id),
-        "coverage": TableCell(coverage_text(coverage), value=coverage),
+        "coverage": TableCell(coverage_text(coverage, truth_share), value=coverage),
         "× real time": speed_cell(board, ended),
         "MB": number(median_of(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(small=runs[0].program_remark, tag=origin_words),
@@ -309,7 +309,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
 
 
 def _provenance_cell(runs: Sequence[RunRow]) -> TableCell:
-    """How closely a tracker follows its source, and whose masks it used."""
+    """Words on how closely a tracker follows its source, and whose masks it used."""
     provenance = runs[0].tracker.provenance
     networks = {row.segmentation for row in runs} - {"", "none"}
     masks = " + ".join(sorted({label_text(network) for network in networks}))
@@ -364,7 +364,7 @@ def verdict_cell(board: Board, standing: Standing) -> TableCell:
 
 
 def lost_words(standing: Standing) -> str:
-    """How many sequences a tracker alone lost, and the reference alone; empty where there are none."""
+    """Words on how many sequences a tracker alone lost, and the reference alone; empty where there are none."""
     if not any(standing.lost):
         return ""
     by_tracker, by_reference = standing.lost
@@ -809,7 +809,7 @@ def _append_trained_scenes(board: Board, rows: Sequence[list[TableCell]]) -> Non
 
 
 def _per_sequence_caption(board: Board, protocol: Protocol, usual_runs: int) -> str:
-    """How to read the errors by sequence."""
+    """Sentences on reading the errors by sequence."""
     first = board.sequences[0]
     short_names = ""
     if board.short[first] != first:
@@ -831,7 +831,7 @@ _REPORTED_NOTE = (
     "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
     "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
 )
-"""How to read the rows of published numbers."""
+"""Sentences on reading the rows of published numbers."""
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -940,7 +940,7 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
 
 
 def false_motion(board: Board, protocol: Protocol) -> Table | None:
-    """How far each tracker says that a fixed camera moved; None without a recording of one."""
+    """Table of how far each tracker says that a fixed camera moved; None without a recording of one."""
     farthest = medians(board, lambda row: row.metrics.get("false_motion_max_m"))
     if not farthest:
         return None
@@ -998,7 +998,7 @@ def _ate_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual_runs:
     cell = board.cells[key].get(sequence)
     if cell is None:
         return TableCell("–", emphasis="muted", tip="not run")
-    coverage = f"coverage {coverage_text(mean_of(row.coverage for row in cell.rows))}"
+    coverage = f"coverage {coverage_text(*mean_coverage(cell.rows))}"
     link = run_link(cell.typical)
     count = "" if len(cell.rows) == usual_runs else f"n={len(cell.rows)}"
 
@@ -1070,7 +1070,7 @@ _VERDICT_SHADES = {"better": shade(0.5), "better, but lost": shade(0.7), "worse"
 
 
 def failure_rule_table(board: Board) -> Table | None:
-    """How much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
+    """Table of how much the ranking depends on how failures and lost frames are counted; None if nothing was lost."""
     if not board.ranked or not any(row.incomplete or row.failed for row in board.rows):
         return None
     rules: dict[str, Callable[[RunRow], float | None]] = {
@@ -1114,7 +1114,7 @@ def _tracked_error(row: RunRow) -> float | None:
 
 
 def run_link(row: RunRow) -> str:
-    """Where the page of a run lies, seen from the report's."""
+    """Path of a run's page, seen from the report's."""
     return f"run.html#{row.run_id}"
 
 
@@ -1135,7 +1135,7 @@ def failures(board: Board) -> Table | None:
             TableCell(board.sequence(row)),
             TableCell(row.repeat),
             TableCell(row.ending),
-            TableCell(coverage_text(row.coverage), value=row.coverage),
+            TableCell(coverage_text(row.coverage, row.truth_share), value=row.coverage),
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
@@ -1179,7 +1179,7 @@ def repeatability(board: Board) -> Table | None:
 
 
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
-    """How far the runs of a tracker lie apart; empty if it has no cell with several."""
+    """Words on how far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
     # cells whose seeds all gave one result, and cells with several different ones
     n_copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())

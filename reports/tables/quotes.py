@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import dynslam_bench
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.model.answers import limits, typical_error
 from dynslam_bench.reports.model.board import Board
@@ -13,7 +14,6 @@ from dynslam_bench.reports.tables.table import (
     Table,
     TableCell,
     escape_latex,
-    mm,
     numbers,
     texts,
     to_latex,

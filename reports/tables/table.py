@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from dynslam_bench.core import printable
 from dynslam_bench.reports.model.names import OUR_BACK_END
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
-"""How a cell is set, see `TableCell`."""
+"""Emphasis with which a cell is set, see `TableCell`."""
 MOST_ROWS = 1000
 """Rows that pages and Markdown show; CSV has all."""
 
@@ -231,21 +230,6 @@ def _no_formula(value: object) -> object:
     return value
 
 
-def mm(metres: float) -> str:
-    """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
-    return significant_text(1000.0 * metres)
-
-
-def significant_text(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits and no exponent where that can be read."""
-    if not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    text = f"{value:#.{digits}g}"
-    return f"{value:.0f}" if "e+" in text else text.rstrip(".")
-
-
 def percent(share: float) -> str:
     """A share as whole percents, but nothing short of all is 100 % and nothing above none 0 %."""
     # 100 % and 0 % are said of whole shares alone
@@ -284,6 +268,8 @@ _LATEX = {
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
         "|": r"\textbar{}",
+        # behind a line's end a bracket would be its optional argument, and LaTeX go on for ever
+        "[": "{[}",
     },
     **{
         "<": r"\textless{}",
@@ -341,11 +327,15 @@ def to_latex(table: Table, protocol: str = "") -> str:
     )
 
 
+_BREAKS = re.compile(r"([./?=]|\\_|\\&)(?=[A-Za-z0-9])")
+"""Where a long name may be broken, such as a setting's."""
+
+
 def escape_latex(text: str) -> str:
     """Text with LaTeX's special characters escaped, on one line.
 
     Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs
-    for, are named by their code point: ``[U+1F600]``.
+    for, are named by their code point, U+1F600 in brackets.
     """
     return "".join(_character(character) for character in " ".join(text.split()))
 
@@ -359,7 +349,7 @@ def _character(character: str) -> str:
     # a letter without its accent, where pdflatex has no glyph
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
     if not plain:
-        return f"[U+{ord(character):04X}]"
+        return f"{{[}}U+{ord(character):04X}]"
     return "".join(_LATEX.get(letter, letter) for letter in plain)
 
 
@@ -464,7 +454,9 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
             if position in table.separators and body:
                 body.append("\\midrule")
             name, *others = (_latex_cell(row[at]) for at in columns)
-            body.append(" & ".join([f"\\raggedright {name}" if wide else name, *others]) + " \\\\")
+            if wide:
+                name = "\\raggedright " + _BREAKS.sub(r"\1\\allowbreak{}", name)
+            body.append(" & ".join([name, *others]) + " \\\\")
         height = head_lines + sum(lines[first : first + fitting])
         begin = [f"\\begin{{tabular}}{{@{{}}{alignment}@{{}}}}", "\\toprule", *head, "\\midrule"]
         parts.append(("\n".join([*begin, *body, "\\bottomrule", "\\end{tabular}"]), height))

@@ -72,7 +72,7 @@ def fill(folder: str, count: int, results: str) -> list[float]:
     entries = []
     for spec in specs(folder, count):
         run = resolver(spec)
-        record = model.model_copy(update={"run_id": run.run_id, "identity": run.stated})
+        record = model.model_copy(update={"run_id": run.run_id, "identity": run.identity})
         copy = store.folder(run.run_id)
         copy.mkdir()
         for name in (ONLINE, FINAL):

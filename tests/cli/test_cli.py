@@ -189,8 +189,6 @@ def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli
     findings = found["findings"]
     assert "truth-inverted" in {finding["id"] for finding in findings}
     assert found["verdict"] == "1 fault: not ready"
-    code, out, _ = cli("sequences", "doctor", faulty)
-    assert (code, out.splitlines()[-1]) == (4, f"{faulty}: 34 frames compared, 1 fault: not ready")
     code, out, _ = cli("sequences", "doctor", sound)
     assert code == 0
     assert out.endswith(": ready\n")
@@ -252,7 +250,9 @@ def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
     assert code == 0
-    assert out.startswith("ATE (rmse) 0.0000 m over 4 poses [tum-rgbd/v1")
+    assert out.startswith(
+        "ATE (rmse) 0.000 mm over 4 poses, 100.0 % of the truth's time [tum-rgbd/v1"
+    )
     found = facts("eval", truth, truth, "--protocol", "evo-default")
     assert found["protocol_id"] == "evo-default"
     assert found["metrics"]["ate_rmse_m"] < 1e-9
@@ -492,7 +492,7 @@ def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
     )
     code, out, _ = cli(*command, "--published", "77")
     assert code == 0
-    assert "No row agrees with 77; the nearest is" in out.splitlines()[-1]
+    assert "No row agrees with 77 m; the nearest is" in out.splitlines()[-1]
     code, _, err = cli(*command, "--published", "7cm")
     assert code == 1
     assert "as it was printed" in one_line(err)

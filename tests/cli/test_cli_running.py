@@ -102,6 +102,18 @@ def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, tmp_
     assert len(read_tum(Path(err.splitlines()[-1].rpartition(": ")[2]))) == 4
 
 
+@pytest.mark.parametrize("named", ["recording", "./recording", "{}/recording"])
+def test_what_a_folder_is_taken_for_is_said_once(cli, tmp_path, named):
+    folder = write_folder(tmp_path / "recording", 4)
+    camera = folder / "camera.toml"
+    camera.write_text(camera.read_text().replace("fps = 30", "fps = 3"))
+    code, out, err = cli("run", "never-move", named.format(tmp_path))
+    assert code == 0, err
+    assert err.count("taken for layout tum: colour in rgb") == 1
+    assert (out + err).count("fps = 3 is stated") == 1
+    assert "warning: recording: fps = 3 is stated" in out
+
+
 def test_a_folder_whose_camera_is_not_known_names_the_choices(cli, walk, tmp_path):
     shutil.copytree(walk, tmp_path / "mine")
     (tmp_path / "mine" / "camera.toml").rename("cam.toml")
@@ -138,7 +150,8 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
     code, _, err = cli(*command)
     assert code == 1
-    assert "170 MB" in err
+    assert "0.25 MB" in err
+    assert "Apache-2.0" in err
     assert not fetched.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
     assert cli(*command)[0] == 0

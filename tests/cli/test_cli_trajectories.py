@@ -194,7 +194,8 @@ def test_files_are_scored_with_the_same_lines_at_every_entrance(cli, tmp_path, c
         ["runs", "show"],
     ):
         code, out, _ = cli(*words)
-        assert code == 0
+        # an import of poses for less than half of the time is that of a lost camera
+        assert code == (3 if words is imported and len(change(ESTIMATE)) == 2 else 0)
         assert re.search(remark, out), (words, out)
 
 
@@ -288,7 +289,14 @@ def test_eval_of_one_estimate_shows_every_statistic(cli, tmp_path):
     out = cli("eval", *files)[1]
     assert len(out.splitlines()) < 14
     numbers = set(out.split())
-    assert [name for name, value in metrics.items() if f"{value:.4g}" not in numbers] == []
+    # lengths in millimetres; JSON alone has sums of squares
+    shown = {name: value for name, value in metrics.items() if "_sse_" not in name}
+    scaled_by = {name: 1000 if name.endswith("_m") else 1 for name in shown}
+    assert len(shown) > 30
+    assert [
+        name for name, value in shown.items() if f"{scaled_by[name] * value:.4g}" not in numbers
+    ] == []
+    assert "ate (mm)" in out
 
 
 def test_a_table_of_trajectories_is_a_board_in_one_command(cli, tmp_path):
@@ -318,7 +326,10 @@ def test_a_table_of_trajectories_is_a_board_in_one_command(cli, tmp_path):
     lines = {name: next(row for row in rows if name in row) for name in ("whole", "half")}
     assert "2/2" in lines["whole"]
     assert "1 of 2" in lines["half"]
-    assert "unknown" in lines["half"], "coverage: the frames are not known"
+    # the frames are not known: in place of the coverage stands the share of the truth's time
+    assert "50 % of the truth's time" in lines["half"]
+    assert "100 % of the truth's time" in lines["whole"]
     records = [path.read_text() for path in (tmp_path / "people" / "runs").glob("*/run.json")]
-    spans = {re.search(r"are (\d+) % of the ground truth's time", record)[1] for record in records}
-    assert spans == {"100", "50"}
+    shares = [json.loads(record)["truth_share"] for record in records]
+    assert sorted(shares) == pytest.approx([0.5, 1, 1, 1, 1], abs=0.01)
+    assert {json.loads(record)["coverage"] for record in records} == {None}

@@ -27,7 +27,7 @@ from dynslam_bench.evaluation import (
 )
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG, align
 from dynslam_bench.evaluation.ape import ate_rmse_m
-from dynslam_bench.evaluation.comparison import nearest_match
+from dynslam_bench.evaluation.comparison import nearest_match, share_of_time
 from dynslam_bench.evaluation.rpe import segment_errors
 from dynslam_bench.geometry import Trajectory, load_tum, read_tum, se3, write_kitti, write_tum
 from dynslam_bench.geometry.rigs import (
@@ -970,3 +970,19 @@ def test_compare_protocols_shows_how_far_they_are_apart():
     missing = next(row for row in short if row.label == "TUM, 1 s, fixed delta")
     assert missing.rmse_m is None
     assert "1 s" in missing.note
+
+
+@pytest.mark.parametrize(
+    ("stamps", "share"),
+    [
+        (np.arange(0, 10.1, 0.1), 1.0),
+        (np.arange(0, 5.1, 0.1), 0.5),
+        (np.r_[0:2:0.1, 2.0, 8.0, 8.1:10.05:0.1], 0.4),  # a hole of 6 s
+        (np.arange(-5, 5.1, 0.1), 0.5),  # the first half lies before the truth
+        (np.arange(0, 10.1, 2.0), 1.0),  # keyframes alone: steps of 2 s are no holes
+        (np.array([3.0]), 0.0),
+        (np.array([20.0, 30.0]), 0.0),
+    ],
+)
+def test_the_share_of_the_truths_time_leaves_out_holes(stamps, share):
+    assert share_of_time(stamps, np.arange(0, 10.01, 0.01)) == pytest.approx(share, abs=0.011)

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -26,11 +27,14 @@ from dynslam_bench.evaluation.gate import GateVerdict
 from dynslam_bench.gate.baseline import Measurement, Origin, Side, poses_digest
 from dynslam_bench.gate.config import GateConfig, Guardrails
 from dynslam_bench.gate.judging import judge
+from dynslam_bench.gate.revisions import build, commit_of, untracked_files, working_tree
 from dynslam_bench.gate.trajectory_folder import file_name
+from dynslam_bench.gate.worker import make
 from dynslam_bench.geometry import Trajectory, read_tum, write_tum
 from dynslam_bench.runs.process.fork_server import START_VARIABLE
 
-CASES = [f"sequence {number}" for number in range(8)]
+SCHEMA = Path(gates.__file__).with_name("gate.schema.json")
+CASES = [f"sequence {number}" for number in range(24)]
 CONFIG = GateConfig(trackers=("a",), sequences=("b",))
 
 
@@ -175,9 +179,37 @@ def test_a_fall_of_coverage_breaks_a_gate_whose_errors_are_smaller() -> None:
         run.coverage = 0.9
     found = judge(baseline, candidate, CONFIG, 4)
     assert found.verdict is GateVerdict.IMPROVED
+    assert found.overall is GateVerdict.REGRESSED
     assert found.exit_code == 4
     assert [rail.state for rail in found.guardrails] == ["broken"]
     assert found.guardrails[0].measured == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("rounds", [2, 4, 8])
+def test_one_sequence_of_many_that_is_hardly_tracked_is_no_improvement(rounds) -> None:
+    baseline = side_of("a", noisy(24, spread=0.01))
+    candidate = side_of("b", noisy(24, scale=0.95, spread=0.01, seed=1))
+    for run in candidate.by_case["sequence 0"]:
+        run.coverage = 0.6
+    found = judge(baseline, candidate, CONFIG, rounds)
+    assert found.verdict is GateVerdict.IMPROVED
+    assert found.guardrails[0].measured < CONFIG.guardrails.coverage
+    assert "sequence 0" in found.guardrails[0].text
+
+    # a few rounds may be chance, eight are not
+    assert found.exit_code == (4 if rounds == 8 else 5)
+    expected = GateVerdict.REGRESSED if rounds == 8 else GateVerdict.UNDECIDED
+    assert found.overall is expected
+    assert found.is_settled is (rounds == 8)
+
+
+@pytest.mark.parametrize("limits", [{"frame_time": 1.2}, {"memory": 1.2}])
+def test_a_limit_on_what_no_run_tells_is_no_pass(limits) -> None:
+    errors = noisy()
+    found = judged(errors, errors, 1, guarded(**limits))
+    assert found.verdict is GateVerdict.IDENTICAL
+    assert found.overall is GateVerdict.UNDECIDED
+    assert found.exit_code == 5
 
 
 @pytest.mark.parametrize(
@@ -242,6 +274,8 @@ def write_gate(folder, sequences, **values):
         {"suite": "smoke"},
         {"margin": 0},
         {"guardrails": {"frame_time": 0.9}},
+        {"seed": 2**70},
+        {"build_minutes": 0},
     ],
 )
 def test_a_wrong_question_is_refused(tmp_path, values) -> None:
@@ -279,6 +313,20 @@ def test_equal_cases_are_refused(tmp_path) -> None:
     file = write_gate(tmp_path, ["synthetic/walking_xyz", "synthetic/walking_xyz"])
     with pytest.raises(RunError):
         gates.load_gate(file).cases()
+
+
+def test_sequences_that_are_too_short_for_all_rounds_are_refused_first(tmp_path, sequences) -> None:
+    question = write_gate(tmp_path, sequences, frames=[0, 7], rounds=8)
+    with pytest.raises(RunError) as caught:
+        gates.compare("HEAD", "", question)
+    assert "7 frames are too few" in str(caught.value)
+    assert "9 are needed" in str(caught.value)
+
+
+def test_a_run_that_the_package_of_a_checkout_refuses_is_one_line() -> None:
+    answer = make({"spec": {"tracker": "a", "sequence": "b", "seed": -1}, "results": "nowhere"})
+    assert "seed" in answer["error"]
+    assert "\n" not in answer["error"]
 
 
 def test_the_digest_of_poses_ignores_comments(tmp_path) -> None:
@@ -454,6 +502,46 @@ class TestBadInput:
         assert "code 7: the compiler says no" in str(caught.value)
         assert not git(repository, "worktree", "list").count("\n")
 
+    @pytest.mark.parametrize("name", ["^HEAD", "HEAD..HEAD", "my branch", "-x", "--all", ""])
+    def test_a_text_that_names_no_commit(self, repository, name) -> None:
+        with pytest.raises(RunError) as caught:
+            commit_of(repository, name)
+        assert f"'{name}'" in str(caught.value)
+
+    def test_a_repository_that_git_does_not_read(self, repository, monkeypatch) -> None:
+        monkeypatch.setenv("GIT_TEST_ASSUME_DIFFERENT_OWNER", "1")
+        with pytest.raises(RunError) as caught:
+            commit_of(repository, "HEAD")
+        assert "ownership" in str(caught.value)
+        assert "safe.directory" in caught.value.hint
+
+    def test_a_build_that_hangs_ends_with_all_that_it_started(self, tmp_path) -> None:
+        # the end of the pipe is read when the last process that holds it is gone
+        os.mkfifo(tmp_path / "pipe")
+        reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+        command = "exec 3>pipe; sleep 600 & echo compiling; wait"
+        with pytest.raises(RunError) as caught:
+            build(command, tmp_path, "revision a", minutes=1 / 60)
+        assert "did not end" in str(caught.value)
+        assert "compiling" in str(caught.value)
+        os.set_blocking(reader, True)
+        assert os.read(reader, 1) == b""
+        os.close(reader)
+
+    def test_a_build_that_asks_gets_no_answer(self, tmp_path) -> None:
+        with pytest.raises(RunError) as caught:
+            build("read answer || exit 9", tmp_path, "revision a", minutes=1)
+        assert "exit code 9" in str(caught.value)
+
+    def test_files_that_no_revision_holds(self, repository) -> None:
+        (repository / "parameters ä.yaml").write_text("a: 1\n")
+        (repository / "build").mkdir(exist_ok=True)
+        (repository / "build" / "ignored").touch()
+        assert untracked_files(repository) == ["parameters ä.yaml"]
+        assert untracked_files(repository, (repository / "parameters ä.yaml",)) == []
+        git(repository, "add", "-A")
+        assert working_tree(repository).uncommitted == ["parameters ä.yaml"]
+
     def test_missing_sequences(self, repository, sequences) -> None:
         question = write_gate(repository, [*sequences, "tum/fr3/walking_xyz", "nowhere/at_all"])
         with pytest.raises(RunError) as caught:
@@ -549,6 +637,114 @@ def test_trajectories_of_others_are_judged(tmp_path, sequences) -> None:
     assert (
         gates.check(question, trajectories=after, results=results).verdict is GateVerdict.REGRESSED
     )
+
+
+def test_copies_of_one_run_show_no_scatter(tmp_path, sequences) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    results = tmp_path / "results"
+    folders = []
+    for seed, noise_m in ((1, 0.01), (2, 0.05)):
+        folder = write_trajectories(tmp_path / str(seed), sequences, noise_m, runs=3, seed=seed)
+        for sequence in sequences:
+            first = folder / file_name(sequence.name) / "0.txt"
+            for number in (1, 2):
+                first.with_name(f"{number}.txt").write_text(first.read_text())
+        folders.append(folder)
+    gates.record(question, trajectories=folders[0], results=results)
+    result = gates.check(question, trajectories=folders[1], results=results)
+    assert result.verdict is GateVerdict.UNDECIDED
+    assert result.exit_code == 5
+    assert any("equal to the last bit on one, two" in note for note in result.notes)
+
+
+def test_errors_on_other_data_are_not_compared(tmp_path) -> None:
+    sequence = write_folder(tmp_path / "one", 14)
+    question = write_gate(tmp_path, [sequence], build="")
+    files = write_trajectories(tmp_path / "files", [sequence], 0.01)
+    gates.record(question, trajectories=files, results=tmp_path / "results")
+    truth = read_tum(sequence / "groundtruth.txt")
+    truth.T_world_cam[:, 0, 3] *= 1.1
+    write_tum(sequence / "groundtruth.txt", truth)
+    with pytest.raises(RunError) as caught:
+        gates.check(question, trajectories=files, results=tmp_path / "results")
+    assert "other data of one" in str(caught.value)
+
+
+def test_the_files_of_a_sequence_are_told_apart(tmp_path, sequences) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    files = write_trajectories(tmp_path / "files", sequences, 0.01)
+    (files / ".one.txt").write_text("hidden")
+    gates.record(question, trajectories=files, results=tmp_path / "results")
+
+    # a second file could be meant
+    (files / "one.bak").write_text((files / "one.txt").read_text())
+    with pytest.raises(RunError) as caught:
+        gates.check(question, trajectories=files)
+    assert "one.bak, one.txt" in str(caught.value)
+
+
+def test_two_sequences_whose_files_have_one_name_are_refused(tmp_path) -> None:
+    names = ["a b", "a_b"]
+    folders = [write_folder(tmp_path / name, 14) for name in names]
+    question = write_gate(tmp_path, folders, build="")
+    with pytest.raises(RunError) as caught:
+        gates.record(question, trajectories=tmp_path)
+    assert "same name, a_b" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda text: text[: len(text) // 2], "Invalid JSON"),
+        (lambda text: text.replace('"schema_version": 1', '"schema_version": 2, "x": 1'), "schema"),
+        (lambda text: text.replace('"round": 0', '"round": 1', 1), "round 1 where 0"),
+        (lambda text: re.sub(r'"ate_m": [0-9.e-]+', '"ate_m": "Infinity"', text), "finite"),
+        (lambda text: re.sub(r'"ate_m": [0-9.e-]+', '"ate_m": "NaN"', text), "ate_m"),
+        (lambda text: text.replace('"margin"', '"margins"'), "margins"),
+    ],
+)
+def test_a_damaged_baseline_is_refused_in_one_line(tmp_path, sequences, damage, words) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    files = write_trajectories(tmp_path / "files", sequences, 0.01)
+    gates.record(question, trajectories=files, results=tmp_path / "results")
+    baseline = tmp_path / "gate-baseline.json"
+    before = baseline.read_text()
+    baseline.write_text(damage(before))
+    assert baseline.read_text() != before
+    with pytest.raises(RunError) as caught:
+        gates.check(question, trajectories=files, results=tmp_path / "results")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.hint
+
+    # the cure works
+    made = gates.record(question, trajectories=files, results=tmp_path / "results")
+    assert words in made.notes[0]
+    again = gates.check(question, trajectories=files, results=tmp_path / "results")
+    assert again.verdict is GateVerdict.IDENTICAL
+
+
+def test_the_json_fits_its_schema_and_nothing_else_does(tmp_path, sequences) -> None:
+    jsonschema = pytest.importorskip("jsonschema", reason="jsonschema (extra [test]) is missing")
+    schema = json.loads(SCHEMA.read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    question = write_gate(tmp_path, sequences, build="", guardrails={"sequence": 1.2})
+    results = tmp_path / "results"
+
+    # an identical result, an undecided one, and one with an interval and a broken guardrail
+    before = write_trajectories(tmp_path / "before", sequences, 0.01, runs=2)
+    single = write_trajectories(tmp_path / "single", sequences, 0.05, seed=1)
+    after = write_trajectories(tmp_path / "after", sequences, 0.05, runs=2, seed=2)
+    gates.record(question, trajectories=before, results=results)
+    for files in (before, single, after):
+        made = gates.check(question, trajectories=files, results=results)
+        written = json.loads((Path(made.folder) / "gate.json").read_text())
+        assert list(validator.iter_errors(written)) == []
+    assert written["low"] > 1.0
+
+    for name, value in [("verdict", "fine"), ("ratio", "1.0"), ("unknown", 1), ("lost", [0])]:
+        assert not validator.is_valid(written | {name: value}), name
 
 
 def test_a_missing_trajectory_is_named(tmp_path, sequences) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from evo.tools import file_interface
+from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry import (
@@ -102,6 +103,20 @@ def test_quaternions_are_normalised_and_canonical():
     _, again = se3.to_quaternion(poses)
     assert np.allclose(np.linalg.norm(again, axis=1), 1)
     assert (again[:, 3] > 0).all()
+
+
+def test_rotations_of_quaternions_have_the_bits_of_scipy():
+    rng = np.random.default_rng(0)
+    quaternions = rng.normal(size=(10, 100, 4)) * np.logspace(-6, 6, 100)[:, None]
+    quaternions[0] = np.round(quaternions[0], 4)  # as a file may hold them
+    rotations = se3.from_quaternion(np.zeros(3), quaternions)[..., :3, :3]
+    expected = Rotation.from_quat(quaternions.reshape(-1, 4)).as_matrix()
+    assert np.array_equal(rotations.reshape(-1, 3, 3), expected)
+
+
+def test_a_quaternion_of_length_zero_is_refused():
+    with pytest.raises(ValueError, match="length 0"):
+        se3.from_quaternion(np.zeros((2, 3)), np.eye(4)[:2] * [[1.0], [0.0]])
 
 
 @pytest.mark.parametrize(

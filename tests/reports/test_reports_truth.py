@@ -21,6 +21,7 @@ from helpers.reports_fake_store import (
     rows_of,
 )
 
+from dynslam_bench.core.number_text import mm
 from dynslam_bench.reports import build_report, compare, load_board, load_frame
 from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums
 from dynslam_bench.reports.model.board import Board, make_board, missing_commands, missing_note
@@ -29,7 +30,7 @@ from dynslam_bench.reports.model.names import make_labels, name_columns, shorten
 from dynslam_bench.reports.model.published import is_excerpt, least_length_s
 from dynslam_bench.reports.model.row import command_line, run_command
 from dynslam_bench.reports.tables.leaderboard import leaderboard, per_sequence, relative_errors
-from dynslam_bench.reports.tables.table import mm, percent, to_markdown
+from dynslam_bench.reports.tables.table import percent, to_markdown
 from dynslam_bench.runs.record import IDENTITY_SCHEME
 from dynslam_bench.runs.store import RunStore
 from dynslam_bench.segmentation.training_scenes import seen_in_training

@@ -1,6 +1,6 @@
 """What the page of a run opens with: its level, its moment, and a caption of what is drawn; charts on paper."""
 
-import base64
+import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from helpers.reports_fake_store import PROTOCOL, add_frames, add_run, page_data
 
 from dynslam_bench.reports import build_report, figures, make_board
-from dynslam_bench.reports.html.still import still
+from dynslam_bench.reports.html.static_chart import static_chart
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs.store import RunStore
 
@@ -93,33 +93,34 @@ def test_without_pictures_a_page_keeps_track_curves_and_residuals(store, tmp_pat
         assert names == ["true path", "estimate", "residuals"]
 
 
-def svg_of(address):
-    """The picture behind an address."""
-    kind, _, encoded = address.partition(",")
-    assert kind == "data:image/svg+xml;base64"
-    return ElementTree.fromstring(base64.b64decode(encoded))
+def words_in(chart):
+    """The texts of a static picture."""
+    picture = ElementTree.fromstring(chart)
+    return {element.text for element in picture.iter() if element.tag == "text"}
 
 
-def words_in(picture):
-    return {
-        "".join(element.itertext()).strip()
-        for element in picture.iter()
-        if element.tag.endswith("}text")
-    }
+def test_static_pictures_have_the_trackers_and_one_mark_a_sequence(store):
+    for number, error in enumerate((0.01, 0.02, 0.04, 0.08)):
+        add_run(store, "one & only", f"s/{number}", error=error)
+        add_run(store, "other", f"s/{number}", error=2 * error)
+    board = make_board(load_runs([store], PROTOCOL).rows)
+    figure = figures.error_figure(board)
+    strip = static_chart(figure)
+    assert {"one & only", "other", "10", "100", "not moving"} <= words_in(strip)
+    assert strip.count("<circle") == 8
+    # the axis is logarithmic
+    places = [float(x) for x in re.findall(r'<circle cx="([0-9.]+)"', strip)[:4]]
+    logs = np.log(np.array(figure.data[0].x, dtype=float))
+    line = np.polynomial.Polynomial.fit(logs, places, 1)
+    assert line(logs) == pytest.approx(places, abs=0.2)
+    curves = static_chart(figures.cumulative_figure(board))
+    assert {"one & only", "other", "0", "100"} <= words_in(curves)
+    assert curves.count("<path") == 4, "a curve and its sample in the legend, twice"
 
 
-def test_a_static_picture_has_the_words_of_its_chart():
-    trace = go.Scatter(
-        x=[1, 10, None], y=["a &amp; b", "c $x$", "c $x$"], mode="markers", name="one<br>two"
-    )
-    layout = go.Layout(height=300, showlegend=True, xaxis=figures.mm_axis("error (mm)"))
-    words = words_in(svg_of(still(go.Figure([trace], layout))))
-    assert {"a & b", "c $x$", "error (mm)", "1", "2", "5", "10", "one", "two"} <= words
-
-
-def test_a_chart_that_cannot_be_drawn_still_has_no_picture():
-    assert still(go.Figure([go.Scatter3d(x=[1], y=[1], z=[1])])) == ""
-    assert still(go.Figure()) == ""
+def test_other_charts_have_no_static_picture():
+    assert static_chart(go.Figure([go.Scatter3d(x=[1], y=[1], z=[1])])) == ""
+    assert static_chart(go.Figure()) == ""
 
 
 def test_the_curve_counts_the_sequences_below_an_error(store):

@@ -14,8 +14,10 @@ import pytest
 from dynslam_bench import rounds
 from dynslam_bench.core import DynslamError, RunError, file_sha256
 from dynslam_bench.core.fingerprint import this_machine
+from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
+from dynslam_bench.rounds.entering import check_is_new
 from dynslam_bench.rounds.files import (
     Program,
     RoundFolder,
@@ -23,7 +25,7 @@ from dynslam_bench.rounds.files import (
     open_round,
     renderer_versions,
 )
-from dynslam_bench.rounds.programs import difference
+from dynslam_bench.rounds.programs import difference, program_of
 from dynslam_bench.rounds.running import check_runner
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.testing.template import write_tracker_template
@@ -78,7 +80,7 @@ def test_scenes_come_from_salt_name_family_and_index(tmp_path: Path) -> None:
     sequences = opened.round.sequences(SALT)
     assert len(set(sequences)) == 4
     parsed = [parse_synthetic_id(sequence) for sequence in sequences]
-    assert [(each.name, each.frames, each.split) for each in parsed] == [
+    assert [(scene.name, scene.frames, scene.split) for scene in parsed] == [
         ("walking_xyz", 6, "held-out"),
         ("walking_xyz", 6, "held-out"),
         ("crowd_xyz", 6, "held-out"),
@@ -190,6 +192,15 @@ def test_an_entry_counts_as_it_was_when_the_round_was_revealed(tmp_path: Path) -
         opened.received_entry("still")
 
 
+def test_one_tracker_with_the_same_settings_enters_once(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    entered(opened, "still")
+    program = opened.read_entry("still").program
+    with pytest.raises(RunError, match="entry 'still' is the same tracker"):
+        check_is_new(opened, "never-move", program)
+    check_is_new(opened, "never-move", program.model_copy(update={"settings": {"n": 1}}))
+
+
 def test_an_entry_of_another_protocol_or_round_is_refused_by_name(tmp_path: Path) -> None:
     opened = written(tmp_path / "r")
     entered(opened, "other", protocol="evo-default")
@@ -212,9 +223,10 @@ def test_an_entry_of_another_protocol_or_round_is_refused_by_name(tmp_path: Path
             "made with version 5 of the renderer, here it is 6",
         ),
         (
-            {"renderer": {"renderer": 6, "crowd_xyz": 7}},
+            {"renderer": {"renderer": 6, "walking_xyz": 0, "crowd_xyz": 7}},
             "made with version 7 of family 'crowd_xyz'",
         ),
+        ({"renderer": {}}, "made with version None of the renderer"),
         ({"protocol_digest": "0" * 12}, "protocol 'tum-rgbd/v1' has the digest"),
     ],
 )
@@ -264,19 +276,47 @@ def test_programs_differ_by_settings_code_weights_and_files() -> None:
         assert words in difference(frozen, frozen.model_copy(update={field: value}))
 
 
+def test_an_entry_is_frozen_with_its_own_files_and_its_package() -> None:
+    reads = Reads(
+        files={
+            "work:/entries/mine/a.py": "1",
+            "work:/entries/mine/looked_for": "",
+            "work:/entries/other/b.py": "2",
+            "plugin:/c.py": "3",
+            "/usr/lib/libm.so.6": "4",
+        },
+        programs={"work:/entries/mine/slam": "5"},
+    )
+    identity = {
+        "settings": {"file": "/home/a/round/entries/mine/net.onnx", "n": 3},
+        "source": {"the environment": "6"},
+        "parts": ["numpy.linalg:norm", "plugin:/c.py:SPEC"],
+        "tracker_version": "2",
+        "weights": {"file": "7"},
+        "reads": reads.model_dump(),
+    }
+    program = program_of("mine", identity)
+    assert program.settings == {"file": "entries/mine/net.onnx", "n": 3}
+    assert program.files == {
+        "work:/entries/mine/a.py": "1",
+        "plugin:/c.py": "3",
+        "work:/entries/mine/slam": "5",
+    }
+    assert program.weights == {"file": "7"}
+    assert program.code.keys() == {"the environment", "package numpy", "its version"}
+    assert program.code["package numpy"]
+
+
 # -- a whole round ---------------------------------------------------------------------------------
 
 
 def first_machine(root: Path) -> None:
     """The organiser and three entrants: commitment, entries, reveal, and all runs."""
-    rounds.new_round(root, name="test", families=["walking_xyz"], scenes=2, frames=6)
+    rounds.new_round(root, name="test", families=["walking_xyz"], scenes=2, frames=4)
     write_tracker_template("mine", root / "entries" / "mine")
     rounds.enter(root, "never-move", name="still")
     rounds.enter(root, "orb-slam2", name="orb", settings={"features.n_features": 700})
-    mine = "entries/mine/mine.py:SPEC"
-    rounds.enter(root, mine, name="mine")
-    with pytest.raises(RunError, match="'mine' is the same tracker"):
-        rounds.enter(root, mine, name="again")
+    rounds.enter(root, "entries/mine/mine.py:SPEC", name="mine")
 
     # this machine with other bits
     of = open_round(root).round
@@ -293,14 +333,16 @@ def first_machine(root: Path) -> None:
 
 def second_machine(root: Path) -> None:
     """A verifier: all is in order, then it is tampered with."""
-    found = rounds.verify(root, by="bob", sample=2)
-    assert found.faults == []
-    assert [again.agreement for again in found.rerun] == ["identical"] * 6
+    verification = rounds.verify(root, by="bob", sample=2)
+    assert verification.faults == []
+    assert [again.agreement for again in verification.rerun] == ["identical"] * 6
+    shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     board = rounds.report(root)
+    assert "Late, not run: late." in board.remarks
     assert {row.entry for row in board.rows} == {"still", "orb", "mine"}
     assert all(row.reproduced == {"bob": (2, 2, 2)} for row in board.rows)
     assert board.faults == []
-    assert "alice" in board.markdown.read_text()
+    assert "run by" in board.markdown.read_text()
     assert board.html.is_file()
 
     changed_trajectory(root)
@@ -320,7 +362,7 @@ def row_of(root: Path, entry: str) -> tuple[Path, Path]:
 
 
 def forge(root: Path, run: Path, changed: Path) -> None:
-    """Bring all checksums up to date after a file was changed, as somebody would who hides it."""
+    """Bring all checksums up to date after a file was changed, as a forger would."""
     bank = root / "results" / "alice"
     part = json.loads((run / "run.json").read_text())["sequence"]["part"]
     for file in bank.glob("runs/*/run.json"):
@@ -339,11 +381,11 @@ def changed_trajectory(root: Path) -> None:
     file = run / "trajectory_online.txt"
     before = file.read_text()
     file.write_text(before.replace(" 0 0 0 0", " 0 0.001 0 0", 1) + "# changed\n")
-    found = rounds.verify(root, by="bob", sample=0)
-    assert any("trajectory_online.txt" in fault and run.name in fault for fault in found.faults)
-    assert rounds.report(root).faults
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert any(
+        "trajectory_online.txt" in fault and run.name in fault for fault in verification.faults
+    )
     file.write_text(before)
-    assert rounds.verify(root, by="bob", sample=0).ok
 
 
 def better_trajectory(root: Path) -> None:
@@ -354,8 +396,8 @@ def better_trajectory(root: Path) -> None:
     shutil.copyfile(part / "groundtruth.txt", run / "trajectory_online.txt")
     forge(root, run, run / "trajectory_online.txt")
     assert rounds.verify(root, by="bob", sample=0).ok
-    found = rounds.verify(root, by="bob", sample=2)
-    (fault,) = found.faults
+    verification = rounds.verify(root, by="bob", sample=2)
+    (fault,) = verification.faults
     assert "still on walking_xyz" in fault
     assert "0.00 mm was published, run again it is" in fault
     restore(root, backup)
@@ -368,8 +410,10 @@ def changed_truth(root: Path) -> None:
     shutil.copytree(root / "results" / "alice", backup)
     shutil.copyfile(run / "trajectory_online.txt", part / "groundtruth.txt")
     forge(root, run, part / "groundtruth.txt")
-    found = rounds.verify(root, by="bob", sample=0)
-    assert sum("ground truth is not that of the scene" in fault for fault in found.faults) == 3
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert (
+        sum("ground truth is not that of the scene" in fault for fault in verification.faults) == 3
+    )
     restore(root, backup)
 
 
@@ -390,15 +434,15 @@ def changed_tracker(root: Path) -> None:
 
 
 def late_entry(root: Path) -> None:
-    shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     with pytest.raises(RunError, match=r"entry 'late' is not listed in reveal\.json"):
         rounds.run(root, by="carol", entries=["late"])
     # rows of an entry that is not listed
     results = root / "results" / "alice" / "results.json"
     results.write_text(results.read_text().replace('"entry": "still"', '"entry": "late"'))
-    found = rounds.verify(root, by="bob", sample=0)
-    assert sum("late on" in fault and "does not list" in fault for fault in found.faults) == 2
-    assert "late" in " ".join(rounds.report(root).remarks)
+    verification = rounds.verify(root, by="bob", sample=0)
+    assert (
+        sum("late on" in fault and "does not list" in fault for fault in verification.faults) == 2
+    )
 
 
 def played(machine: str, folder: Path) -> None:

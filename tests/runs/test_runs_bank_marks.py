@@ -398,8 +398,8 @@ def test_metadata_are_valid_croissant(data_set):
     croissant = pytest.importorskip("mlcroissant", reason="mlcroissant is not installed")
     done = describe_data(data_set[0])
     dataset = croissant.Dataset(jsonld=done.croissant)
-    assert not dataset.metadata.issues.errors
-    assert not dataset.metadata.issues.warnings
+    assert not dataset.metadata.ctx.issues.errors
+    assert not dataset.metadata.ctx.issues.warnings
 
 
 def test_another_folder_is_no_data_set(tmp_path):

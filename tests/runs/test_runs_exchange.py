@@ -714,7 +714,8 @@ def test_a_manifest_names_trajectories_of_sequences_that_are_not_here(tmp_path):
     assert f"checksum {digest}" in added.left_out[0].reason
     record = RunStore(tmp_path / "bank").read(added.added[0])
     assert (record.coverage, record.incomplete, record.provenance) == (None, False, "page 7")
-    assert any("coverage is unknown" in note for note in record.notes)
+    assert any("the coverage are not known" in note for note in record.notes)
+    assert record.truth_share == pytest.approx(1.0)
     assert "high-dynamic" in record.sequence.tags
     row = RunStore(tmp_path / "bank").frame().iloc[0]
     assert 0 < row["ate_rmse_m"] < 0.01

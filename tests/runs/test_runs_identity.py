@@ -223,6 +223,18 @@ def test_a_plug_in_that_copies_all_variables_finds_its_runs_again(
     assert kinds == ["reused"], "which plug-ins are listed is no input"
 
 
+def test_a_variable_whose_name_begins_as_a_plug_in_expects_counts(
+    tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_prefix = (
+        "dict((key[8:], value) for key, value in os.environ.items() if key[:8] == 'TOY_SET_').get("
+    )
+    source = PLUGIN.replace("os.environ.get(", by_prefix)
+    assert source != PLUGIN
+    spec, _ = a_plug_in(tmp_path, source)
+    assert made_again(spec, store, partial(monkeypatch.setenv, "TOY_SET_IDENTITY_TOY_MODE", "fast"))
+
+
 def test_a_plug_in_that_is_only_listed_is_imported_by_nobody(
     tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,12 +31,11 @@ import json, sys
 from pathlib import Path
 from dynslam_bench.core.module_graph import module_files
 spec, folder = sys.argv[1:]
+from dynslam_bench.evaluation import get_protocol
+from dynslam_bench.runs.loop import run_loop
 executed = set()
 # it returns None: no lines are traced; a profiler would be told of every call of C code, too
 sys.settrace(lambda frame, event, _: executed.add(frame.f_code.co_filename))
-from dynslam_bench.evaluation import get_protocol
-from dynslam_bench.runs.loop import run_loop
-executed.clear()
 job = {"spec": json.loads(spec), "folder": folder, "progress_every": 3, "foreign": False}
 run_loop(job | {"protocol": get_protocol("tum-rgbd/v1").model_dump(mode="json")}, lambda message: None, lambda: False)
 sys.settrace(None)

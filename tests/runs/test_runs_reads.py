@@ -312,6 +312,17 @@ def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench
     assert bench.changed(reads) == "the file mask.png"
 
 
+@pytest.mark.parametrize("beside", ["associations.txt", "rgb.txt", "runs/x.json"])
+@pytest.mark.parametrize("named", ["'net.onnx'", "'nets/net.onnx'", "f'{name}.onnx'"])
+def test_a_network_beside_a_list_of_images(named: str, beside: str, bench: Bench) -> None:
+    """The folder looks like a recording or like results; it is opened in machine code."""
+    bench.write("plugin/nets/net.onnx", "1111")
+    bench.write(f"plugin/nets/{beside}", "1111")
+    reads = bench.record(f"def run(name):\n    return {named}\n", name="net")
+    edit(bench.plugin.parent / "nets/net.onnx", "2222")
+    assert bench.changed(reads) == "the file nets/net.onnx"
+
+
 @pytest.mark.parametrize(
     "named", ["'net.onnx'", "'nets/' + name + '.onnx'", "f'{name}.onnx'", "'%s.onnx' % name"]
 )
@@ -482,6 +493,29 @@ def test_a_variable_that_is_not_set_and_looked_up_in_a_copy(copy: str, bench: Be
     assert reads.environment["$MY_SLAM_MODE"] == ""
     bench.environment["MY_SLAM_MODE"] = "slow"
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        "[value for name, value in os.environ.items() if name.startswith('MYSLAM_')]",
+        "{name[7:].lower(): os.environ[name] for name in os.environ if name[:7] == 'MYSLAM_'}",
+        "sorted(filter(__import__('re').compile('^MYSLAM_').match, os.environ.copy()))",
+        "[name for name in os.environb if name.startswith(b'MYSLAM_')]",
+        "any('slam_' in name.lower() for name in dict(os.environ))",
+    ],
+)
+def test_a_variable_that_is_set_later_and_looked_for_by_the_beginning_of_its_name(
+    look: str, bench: Bench
+) -> None:
+    bench.environment["ANOTHER"] = "1"
+    reads = bench.record(f"import os\ndef run():\n    return {look}\n")
+    assert "HOME" not in reads.to_json()
+    # what names the session is no input
+    bench.environment["SSH_TTY"] = "/dev/pts/7"
+    assert bench.changed(reads) == ""
+    bench.environment["MYSLAM_GAIN"] = "2"
+    assert bench.changed(reads) == "the list of environment variables"
 
 
 @pytest.mark.parametrize("look", LOOKS + LISTINGS)

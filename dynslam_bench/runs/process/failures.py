@@ -34,7 +34,7 @@ _RUNNER_FILES = (__file__, str(Path(__file__).with_name("child.py")))
 
 
 class FailedAt(Exception):
-    """Where a run was when its cause was raised."""
+    """Frame at which a run was when its cause was raised."""
 
 
 @contextmanager

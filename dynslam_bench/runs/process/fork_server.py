@@ -70,7 +70,7 @@ PRELOADED = (
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
 _CLOSE_S = 10.0
-"""How long `Child.close` waits for the report of the child's end."""
+"""Seconds that `Child.close` waits for the report of the child's end."""
 
 
 class ForkServer:
@@ -153,7 +153,7 @@ class ForkServer:
 
 
 def default_start() -> str:
-    """How children start: what `START_VARIABLE` says, or what is safe on this system."""
+    """Start method of children: what `START_VARIABLE` says, or what is safe on this system."""
     return os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
 
 
@@ -196,7 +196,7 @@ class Child:
         self._exit: int | None = None
 
     def poll(self) -> int | None:
-        """Its exit code (minus the signal's number if one ended it), None while it runs."""
+        """Exit code of the child (minus the signal's number if one ended it), None while it runs."""
         while self._exit is None:
             try:
                 data = os.read(self.status_fd, 4096)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 LOG_FILE = "log.txt"
-"""Where everything goes that is printed in the child."""
+"""File of everything that is printed in the child."""
 READS_FILE = "reads.json"
-"""Where the child puts what plug-ins and programs have read."""
+"""File of what plug-ins and programs have read in the child."""
 THREAD_VARIABLES = (
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",

@@ -1,4 +1,4 @@
-"""Whose a piece of code is: this package's, Python's, a library's or foreign."""
+"""Origin of a piece of code: this package, Python, a library, or foreign."""
 
 import os
 import sys

@@ -15,7 +15,7 @@ _SET_PARENT_DEATH_SIGNAL = 1
 _SET_CHILD_SUBREAPER = 36
 """``PR_SET_CHILD_SUBREAPER`` of ``prctl(2)``."""
 _END_S = 5.0
-"""How long `end_children` goes on."""
+"""Seconds for which `end_children` goes on."""
 
 
 def adopt_orphans(*, die_with_parent: bool = False) -> None:

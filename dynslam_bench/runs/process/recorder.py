@@ -81,7 +81,7 @@ _IMPORTING = ("<frozen importlib", "<frozen zipimport", os.path.dirname(importli
 _RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
 """These open files by their names in folders that they hold open; the announcement does not tell which folder."""
 _ENVIRONMENT = re.compile(r"/proc/(?:self|\d+)/environ")
-"""Where Linux lists the variables of a process."""
+"""File in which Linux lists the variables of a process."""
 _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
@@ -280,6 +280,7 @@ class ReadRecorder:
     # -- files -------------------------------------------------------------------------------------
 
     def _on_open(self, frame: FrameType, name: Any, mode: str | None, flags: int) -> None:
+        """Note a file that is opened: as read, as made, or both."""
         if isinstance(name, int):  # it was seen when the descriptor was opened
             return
         path = _absolute(name)
@@ -300,6 +301,7 @@ class ReadRecorder:
         self._make(path)
 
     def _on_missing(self, frame: FrameType, name: Any) -> None:
+        """Note a file that foreign code looked for and that is not there."""
         path = None if isinstance(name, int) else _absolute(name)
         if path is None or path in self._notes.missing or not self._counts_by_itself(path):
             return
@@ -309,10 +311,12 @@ class ReadRecorder:
         self._note("missing", path)
 
     def _on_map(self, frame: FrameType, descriptor: int, *_: Any) -> None:
+        """Note a file that is mapped into memory as read."""
         if path := _absolute(descriptor):
             self._read(frame, path)
 
     def _on_database(self, frame: FrameType, name: Any) -> None:
+        """Note an SQLite file as read and as made."""
         text = os.fsdecode(name)
         if text.startswith("file:"):  # a URI, with options behind a question mark
             text = text.removeprefix("file:").partition("?")[0]
@@ -321,6 +325,7 @@ class ReadRecorder:
             self._make(path)
 
     def _on_library(self, frame: FrameType, name: Any) -> None:
+        """Note a library that is loaded as read."""
         # one without a folder is found among what is mapped into memory
         if not isinstance(name, str | bytes) or os.sep not in os.fsdecode(name):
             return
@@ -338,14 +343,17 @@ class ReadRecorder:
         """
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
+        # metadata of a distribution count by their version
         if path.endswith(_VERSIONS):
             self._read_version(frame, os.path.dirname(path))
             return
+        # a file that was noted before must not have changed since
         stamp = stamp_of(path)
         note = self._notes.files.get(path)
         if note is not None:
             self._collector.compare(path, note, stamp)
             return
+        # only files that count, read by code of others, and not made by the run
         is_special = stamp is not None and not os.path.isfile(path)  # a folder, a pipe, a socket
         if is_special or not self._counts_by_itself(path) or not self._is_foreign(frame):
             return
@@ -353,6 +361,8 @@ class ReadRecorder:
             return
         if self._collector.is_made_by_program(stamp):
             return
+
+        # the content now where it is small or may change, else at the end
         note = FileNote(stamp)
         if stamp is not None and whole:
             note.digest = content_now(path)
@@ -419,6 +429,7 @@ class ReadRecorder:
     def _on_rename(
         self, frame: FrameType, source: Any, target: Any, source_folder: int, target_folder: int
     ) -> None:
+        """Note a renamed file as read under its old name and as made under both; a made folder stays one."""
         if path := _absolute(source, source_folder):
             self._read(frame, path)
             self._make(path)
@@ -440,12 +451,14 @@ class ReadRecorder:
             self._make(path)
 
     def _on_mkdir(self, _: FrameType, name: Any, __: int, folder: int) -> None:
+        """Note a new folder: what lies in it was made by the run."""
         path = _absolute(name, folder)
         if path is not None and not os.path.lexists(path):
             self._make(path)
             self._notes.made_folders += (f"{path}{os.sep}",)
 
     def _on_list(self, frame: FrameType, name: Any) -> None:
+        """Note the names in a folder that foreign code lists."""
         path = _absolute("." if name is None else name)
         if path is None or path in self._notes.folders or not is_file_name(path):
             return
@@ -462,6 +475,7 @@ class ReadRecorder:
     # -- modules and variables ---------------------------------------------------------------------
 
     def _on_import(self, frame: FrameType, module: str, *_: Any) -> None:
+        """Note a module that foreign code imports, by its top-level name."""
         top = module.partition(".")[0]
         if top in self._notes.modules or top in sys.stdlib_module_names:
             return
@@ -490,6 +504,7 @@ class ReadRecorder:
         self._note_variables(self._collector.environment)
 
     def _note_variables(self, names: Iterable[str]) -> None:
+        """Note environment variables that count and were not noted yet."""
         for name in names:
             is_known = name in self._notes.variables or f"${name}" in self._notes.made
             if is_counted(name) and name not in SEARCH_PATHS and not is_known:
@@ -501,6 +516,7 @@ class ReadRecorder:
     def _on_popen(
         self, frame: FrameType, executable: Any, words: Any, folder: Any, environment: Any
     ) -> None:
+        """Note a program that is started, and the variables that an adapter gives it."""
         given = [words] if isinstance(words, str | bytes | os.PathLike) else list(words)
         self._start_program(frame, [executable, *given[1:]], folder)
         # an adapter's program gets these variables and no others
@@ -563,6 +579,7 @@ class ReadRecorder:
                     continue
                 if is_fork:  # it writes down itself what it reads
                     continue
+                # look again when the process has grown twice as old
                 key = (process.pid, born_s)
                 age_s = time.time() - born_s
                 if age_s >= max(least_age_s, 2 * self._age_at_look.get(key, 0.0)):

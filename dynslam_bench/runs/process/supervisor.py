@@ -31,7 +31,7 @@ _FIRST_WARM = 1
 _END_GRACE_S = 10.0
 """A child that has sent its last message is ended after this time."""
 _SIGNAL_GRACE_S = 0.5
-"""How long after a child was killed a signal may take to reach this process."""
+"""Seconds that a signal may take to reach this process after a child was killed."""
 _NOT_STORED_HINT = "the run is not stored; the same command goes on from there"
 DEFAULT_SHARE = 0.8
 """Share of the machine's memory that all runs at a time may take together where no limit was given."""
@@ -43,7 +43,7 @@ _CGROUP_LIMITS = (
 
 @dataclass
 class ProcessEnd:
-    """How a child ended.
+    """End of a child.
 
     Attributes:
         status: ``ok`` here means that it came to the end of its loop.
@@ -135,9 +135,9 @@ class _Supervisor:
     memory_mb: float | None
     memory_source: str
     began: float | None = None
-    """When the child said that it was ready."""
+    """Time when the child said that it was ready."""
     last_message: float = field(default_factory=time.monotonic)
-    """When the last message came."""
+    """Time of the last message."""
     frame: int = -1
     """The last frame that was tracked; -1 before the first one."""
     n_frames: int = 0
@@ -147,11 +147,11 @@ class _Supervisor:
     peak_mb: float = 0.0
     """Largest memory measured or reported."""
     stop_sent: float | None = None
-    """When the child was asked to stop."""
+    """Time when the child was asked to stop."""
     next_measurement: float = 0.0
-    """When memory is measured next."""
+    """Time of the next measurement of memory."""
     next_tree: float = 0.0
-    """When the process tree is looked at next."""
+    """Time of the next look at the process tree."""
 
     def run(self) -> ProcessEnd:
         """Take messages until the child has ended or is over a limit."""
@@ -174,7 +174,7 @@ class _Supervisor:
                 return end
 
     def _read_end(self) -> ProcessEnd:
-        """How a child that is gone has ended.
+        """End of a child that is gone.
 
         Raises:
             InfrastructureError: Something beside the run broke.
@@ -232,7 +232,7 @@ class _Supervisor:
             self.child.connection.send_bytes(b"stop")
 
     def _over_limit(self) -> ProcessEnd | None:
-        """How a child ends that is over a limit; None where it may go on.
+        """End of a child that is over a limit; None where it may go on.
 
         Raises:
             InfrastructureError: No process has begun the run within its time to start.
@@ -250,7 +250,7 @@ class _Supervisor:
         return self._too_large(now)
 
     def _stopped(self, now: float) -> ProcessEnd | None:
-        """How a child ends that is not wanted any more."""
+        """End of a child that is not wanted any more."""
         if self.cancelled():
             return self._end("stopped", f"cancelled{self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
@@ -258,7 +258,7 @@ class _Supervisor:
         return None
 
     def _too_late(self, now: float, silent_s: float) -> ProcessEnd | None:
-        """How a child ends that has taken too much time.
+        """End of a child that has taken too much time.
 
         Args:
             now: The time.
@@ -305,7 +305,7 @@ class _Supervisor:
         return tree + others
 
     def _where(self) -> str:
-        """Where the run is, as the end of a reason."""
+        """Words on where the run is, as the end of a reason."""
         if not self.located:
             return ""
         if not self.n_frames:

@@ -8,7 +8,13 @@ from contextlib import contextmanager
 def pinned_threads(
     get: Callable[[], int], put: Callable[[int], None], threads: int
 ) -> Iterator[None]:
-    """Pin the thread count of a library while the block runs (it is one number for the whole process)."""
+    """Pin the thread count of a library while the block runs (it is one number for the whole process).
+
+    Args:
+        get: The library's function that tells the count.
+        put: The library's function that sets it.
+        threads: The count.
+    """
     before = get()
     put(threads)
     try:

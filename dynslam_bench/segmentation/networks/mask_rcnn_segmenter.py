@@ -109,6 +109,7 @@ def load_segmenter(
         raise SegmentationError(
             f"device '{context.device}' is not available: torch {torch.__version__} sees no GPU"
         )
+    # the network must know a dynamic class
     network = load_network(path)
     check_classes(filter(None, network.config.classes), settings, str(path), "the network")
     if settings.network_side > 0:

@@ -30,6 +30,7 @@ SAMPLES = 2
 
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
     """Anchors ``[A, 4]`` of each level around the origin, rounded to pixels as the published models have them."""
+    # of each ratio the height and width of an anchor with the area 1
     ratios = torch.tensor(config.anchor_ratios, device="cpu")
     heights = ratios.sqrt()
     widths = 1 / ratios.sqrt()
@@ -38,7 +39,14 @@ def anchor_cells(config: NetworkConfig) -> list[Tensor]:
 
 
 def anchors_of(cells: list[Tensor], levels: list[Tensor], height: int, width: int) -> list[Tensor]:
-    """Anchors ``[H_l * W_l * A, 4]`` of each level, row by row."""
+    """Anchors ``[H_l * W_l * A, 4]`` of each level, row by row.
+
+    Args:
+        cells: Anchors ``[A, 4]`` of each level around the origin, of `anchor_cells`.
+        levels: Feature maps ``[B, C, H_l, W_l]``.
+        height: Height of the network's input, pixels.
+        width: Width of the network's input, pixels.
+    """
     result = []
     for cell, level in zip(cells, levels, strict=True):
         rows, columns = level.shape[-2:]
@@ -553,6 +561,7 @@ class MaskRCNN(nn.Module):
         Returns:
             ``[1, 3, H', W']`` and the height and width of the image inside it.
         """
+        # the shorter side becomes `min_side`, unless the longer one exceeds `max_side` then
         config = self.config
         height = int(image.shape[-2])
         width = int(image.shape[-1])
@@ -577,6 +586,7 @@ class MaskRCNN(nn.Module):
             score: Least score.
             iou: Overlap of two boxes of one class above which the weaker one is dropped.
         """
+        # backbone, proposals, and the heads on them
         x, size = self.prepare(image)
         levels, mask_levels = self.backbone(x.contiguous(memory_format=torch.channels_last))
         height = int(x.shape[2])
@@ -610,15 +620,18 @@ class MaskRCNN(nn.Module):
             generator: Draws the samples of anchors and proposals.
             per_image: Proposals an image that enter the box losses.
         """
+        # backbone on the padded batch
         batch, _, rows, columns = images.shape
         x = self._pad(normalise(images)).contiguous(memory_format=torch.channels_last)
         height = int(x.shape[2])
         width = int(x.shape[3])
         levels, mask_levels = self.backbone(x)
+        # proposals and the losses of their network
         proposals, anchors, logits, codes = self.rpn(
             levels, height, width, [(rows, columns)] * batch
         )
         objectness, regression = rpn_loss(anchors, logits, codes, boxes, generator)
+        # losses of the heads on a sample of the proposals
         heads = self.roi_heads.losses(
             levels[:4], mask_levels, proposals, boxes, labels, masks, height, generator, per_image
         )
@@ -707,7 +720,14 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
 
 
 def grouped_nms(boxes: Tensor, scores: Tensor, groups: Tensor, threshold: float) -> Tensor:
-    """Suppression within each group (class or level); indices of all that stay, best first."""
+    """Suppression within each group (class or level); indices of all that stay, best first.
+
+    Args:
+        boxes: ``[N, 4]``: x0, y0, x1, y1.
+        scores: ``[N]``.
+        groups: Number of each box's group ``[N]``.
+        threshold: IoU above which the weaker of two boxes is dropped.
+    """
     kept = []
     for group in sorted(set(groups.tolist())):
         members = torch.nonzero(groups == group)[:, 0]
@@ -766,6 +786,7 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     overlap = box_iou(truth, boxes)
     best, index = overlap.max(dim=0)
     result = index.masked_fill(best < high, IGNORED).masked_fill(best < low, NEGATIVE)
+    # every object that is overlapped at all gets the boxes that overlap it most
     if keep_best:
         top = overlap.max(dim=1, keepdim=True).values
         forced = ((overlap == top) & (overlap > 0)).any(dim=0)

@@ -225,6 +225,7 @@ class StaticMaskRCNN(nn.Module):
             large = ((box[:, 2:] - box[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1).to(box.dtype)
             boxes.append(box)
             scores.append(best.sigmoid() * unsuppressed(box_iou(box, box) > config.rpn_nms, large))
+        # the best boxes of all levels; those with score 0 were suppressed
         count = min(config.post_nms, sum(map(len, scores)))
         score, order = torch.cat(scores).topk(count)
         return torch.cat(boxes).index_select(0, order), (score > 0).to(score.dtype)
@@ -233,6 +234,7 @@ class StaticMaskRCNN(nn.Module):
         self, levels: list[Tensor], proposals: Tensor, valid: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Boxes ``[K, 4]`` in pixels of the input, labels and scores of the objects."""
+        # class scores without the background, and a box for each class
         config = self.network.config
         heads = self.network.roi_heads
         pooled = self._pooled(levels, proposals, BOX_POOL, config.canonical)
@@ -289,6 +291,7 @@ class StaticMaskRCNN(nn.Module):
 
     def _pasted(self, planes: Tensor, boxes: Tensor) -> Tensor:
         """Masks ``[K, M, M]`` inside boxes as probabilities ``[K, H, W]`` in the image; see `paste`."""
+        # interpolation along rows and columns as two products of matrices
         if not self.network.config.exact_paste:
             planes, boxes = _grown(planes, boxes)
         rows = _taps(boxes[:, 1], boxes[:, 3], self.height, planes.shape[1])

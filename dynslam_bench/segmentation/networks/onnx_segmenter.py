@@ -83,12 +83,14 @@ class OnnxSegmenter:
     def __init__(
         self, path: Path, settings: SegmentationSettings, *, threads: int = 1, floor: float = 0.1
     ) -> None:
+        # the size of the input is in the file's header
         self.path = path.expanduser()
         self.settings = settings
         self.threads = threads
         self.floor = floor
         inputs, outputs, metadata = read_header(self.path)
         self._size = _input_size(inputs, self.path)
+        # the network
         with translate_errors(
             SegmentationError,
             f"OpenCV {cv2.__version__} cannot load {self.path}",
@@ -96,6 +98,7 @@ class OnnxSegmenter:
             of=(cv2.error, RuntimeError),
         ):
             self._net = cv2.dnn.readNetFromONNX(str(self.path))
+        # how its outputs are read, and which of its classes are wanted
         self._input = inputs[0].name
         self.layout = self._find_layout(outputs, metadata)
         self._check_classes(metadata)
@@ -149,12 +152,14 @@ class OnnxSegmenter:
 
     def _check_classes(self, metadata: Mapping[str, str]) -> None:
         """Raise where no class is a dynamic one; warn of what is assumed of a dynamic one."""
+        # one class at least must be a dynamic one
         objects = {
             number: name
             for number, name in self.layout.names.items()
             if canonical_name(name) not in NO_OBJECT
         }
         check_classes(objects.values(), self.settings, str(self.path), "the network")
+        # names that are guessed are said
         assumed = assumed_names(self.layout, metadata)
         if assumed:
             warnings.warn(f"{self.path}: {assumed}", stacklevel=2)
@@ -171,6 +176,7 @@ class OnnxSegmenter:
         self, image: NDArray[np.uint8], names: list[str], usual: str
     ) -> list[NDArray[np.float32]]:
         """The outputs for an image, scaled as the settings say or else as usual."""
+        # scale, and reorder to [1, 3, H, W]
         scaling: str = self.settings.onnx_normalisation
         if scaling == "auto":
             scaling = usual
@@ -178,6 +184,7 @@ class OnnxSegmenter:
         centred = image.astype(np.float32) - np.array(mean, np.float32)
         scaled = centred / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
+        # run the network on the given number of threads
         with (
             pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads),
             translate_errors(
@@ -255,6 +262,7 @@ def _input_size(inputs: Sequence[TensorInfo], path: Path) -> tuple[int | None, i
             f"{path} has {len(inputs)} inputs: {'; '.join(map(str, inputs))}",
             "a segmentation network takes one image",
         )
+    # [1, 3, H, W] in this order; sizes may be open
     shape = inputs[0].shape
     channels_last = len(shape) == 4 and shape[3] == 3 and shape[1] != 3
     if channels_last or len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
@@ -456,7 +464,17 @@ def _keep(
     settings: SegmentationSettings,
     floor: float,
 ) -> NDArray[np.intp]:
-    """Indices of the wanted detections, best first, that non-maximum suppression within each class keeps."""
+    """Indices of the wanted detections, best first, that non-maximum suppression within each class keeps.
+
+    Args:
+        boxes: Corners ``[N, 4]``, pixels of the input.
+        scores: ``[N]``.
+        labels: Class numbers ``[N]``.
+        layout: Names of the classes, and whether suppression is inside the network.
+        settings: Which classes are dynamic.
+        floor: Least score.
+    """
+    # dynamic classes with enough score, the best first
     keep = np.flatnonzero((scores >= floor) & np.isin(labels, _wanted(layout, settings)))
     if not keep.size:
         return keep
@@ -549,8 +567,10 @@ def _decode_semantic(
         for axis in (0, 1)
     )
     full = np.matmul(np.matmul(rows, logits), columns.T)
+    # margin that the threshold's probability corresponds to
     level = _logit(settings.mask_threshold)
     least_area = at_width(MIN_COMPONENT_SIDE_PX, place.frame[1]) ** 2
+    # one object for each large connected part of a class
     masks = [np.zeros((0, *place.frame), bool)]
     names = []
     scores = []
@@ -577,7 +597,16 @@ def _decode_semantic(
 def _interpolation(
     cells: int, length: int, scale: float, offset: float, count: int, aligned: bool
 ) -> Float:
-    """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis."""
+    """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis.
+
+    Args:
+        cells: Logits along the axis.
+        length: Pixels of the network's input along it.
+        scale: Input pixels in a frame pixel.
+        offset: Place of the frame's first pixel in the input.
+        count: Frame pixels along the axis.
+        aligned: Whether the first and the last cell lie at the input's outermost pixels.
+    """
     # where the pixels' centres lie in the input, then among the cells
     at_input = (np.arange(count) + 0.5) * scale + offset - 0.5
     if aligned:

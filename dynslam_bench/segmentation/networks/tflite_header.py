@@ -1,16 +1,19 @@
 """The header of a TensorFlow Lite file: input, outputs, the operators that make them, labels. No dependency.
 
 A TensorFlow Lite file is one FlatBuffer. Only these fields are decoded (numbers from the public
-schema.fbs): Model.operator_codes = 1, .subgraphs = 2; OperatorCode.deprecated_builtin_code = 0,
-.builtin_code = 3; SubGraph.tensors = 0, .inputs = 1, .outputs = 2, .operators = 3; Operator.opcode_index = 0,
-.outputs = 2; Tensor.shape = 0, .type = 1, .name = 3. TensorFlow's metadata tools append labels
-to the file as a zip archive.
+schema.fbs): Model.operator_codes = 1, .subgraphs = 2, .buffers = 4; Buffer.data = 0;
+OperatorCode.deprecated_builtin_code = 0, .builtin_code = 3; SubGraph.tensors = 0, .inputs = 1,
+.outputs = 2, .operators = 3, .name = 4; Operator.opcode_index = 0, .inputs = 1, .outputs = 2;
+Tensor.shape = 0, .type = 1, .buffer = 2, .name = 3. TensorFlow's metadata tools append labels to
+the file as a zip archive.
 """
 
 from __future__ import annotations
 
+import lzma
 import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,15 +37,25 @@ ELEMENTS = {
 """Types of a tensor's numbers, by the value of TensorType."""
 PROBABILITY_OPERATORS = {14: "LOGISTIC", 25: "SOFTMAX"}
 """Operators whose output lies between 0 and 1, by the value of BuiltinOperator."""
-MOST_TENSORS = 100_000
-"""No network has more; a longer list is damage."""
+MOST_ENTRIES = 100_000
+"""No network has as many tensors or operators; a longer list is damage."""
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    OSError,
+)
+"""Errors of `zipfile` at damaged, encrypted or unknown archives."""
 LONGEST_LABELS = 100_000
 """Bytes of a file of labels; a longer one is none."""
 
 
 @dataclass(frozen=True)
 class TfliteHeader:
-    """What a TensorFlow Lite file declares.
+    """Inputs, outputs and labels that a TensorFlow Lite file declares.
 
     Attributes:
         inputs: Its inputs, images as ``[1, H, W, C]``.
@@ -58,7 +71,7 @@ class TfliteHeader:
 
 
 def read_tflite_header(path: Path) -> TfliteHeader:
-    """What a TensorFlow Lite file declares.
+    """Read the inputs, outputs and labels that a TensorFlow Lite file declares.
 
     Raises:
         SegmentationError: The file is missing, truncated or no TensorFlow Lite model.
@@ -71,12 +84,16 @@ def read_tflite_header(path: Path) -> TfliteHeader:
         SegmentationError,
         f"{path} is not a TensorFlow Lite model ({len(data)} bytes)",
         "the file is truncated or of another format",
-        of=(ValueError, IndexError, struct.error),
+        of=(ValueError, IndexError, struct.error, *_ZIP_ERRORS),
     ):
         if data[4:8] != IDENTIFIER:
             raise ValueError(f"it begins with {data[:8]!r}")
         model = _Table(data, _number(data, "I", 0))
-        graph = model.tables(2)[0]
+        graphs = model.tables(2)
+        if len(graphs) != 1:
+            raise ValueError(f"it has {len(graphs)} graphs")
+        graph = graphs[0]
+        _check_references(model, graph)
         tensors = [_tensor(table) for table in graph.tables(0)]
         inputs = graph.numbers(1)
         outputs = graph.numbers(2)
@@ -95,6 +112,35 @@ def read_tflite_header(path: Path) -> TfliteHeader:
         )
 
 
+def _check_references(model: _Table, graph: _Table) -> None:
+    """Refuse a file that refers to what it does not have: OpenCV would read beyond it, and end the process.
+
+    Raises:
+        ValueError: A name or the numbers of a tensor are missing.
+    """
+    n_bytes = len(model.data)
+    buffers = model.tables(4)
+    for buffer in buffers:
+        first, length = buffer.vector(0)
+        if first + length > n_bytes:
+            raise ValueError(f"numbers end at byte {first + length} of {n_bytes}")
+    tensors = graph.tables(0)
+    for tensor in tensors:
+        if not tensor.text(3) or tensor.number("I", 2) >= len(buffers):
+            raise ValueError("a tensor without a name or numbers")
+    if not graph.text(4):
+        raise ValueError("a graph without a name")
+    used = graph.numbers(1) + graph.numbers(2)
+    for operator in graph.tables(3):
+        # an input that is left out is -1
+        used += [index for index in operator.numbers(1) if index != -1]
+        used += operator.numbers(2)
+        if operator.number("I", 0) >= len(model.tables(1)):
+            raise ValueError("an operator of an unknown kind")
+    if any(not 0 <= index < len(tensors) for index in used):
+        raise ValueError("an operator of an unknown tensor")
+
+
 def _labels(path: Path) -> tuple[str, ...]:
     """The lines of the text file among the appended files; empty where there is none."""
     if not zipfile.is_zipfile(path):
@@ -103,7 +149,9 @@ def _labels(path: Path) -> tuple[str, ...]:
         texts = [entry for entry in archive.infolist() if entry.filename.endswith(".txt")]
         if len(texts) != 1 or texts[0].file_size > LONGEST_LABELS:
             return ()
-        lines = archive.read(texts[0]).decode(errors="replace").splitlines()
+        # the size that an archive states need not be true
+        with archive.open(texts[0]) as file:
+            lines = file.read(LONGEST_LABELS).decode(errors="replace").splitlines()
     return tuple(line.strip() for line in lines if line.strip())
 
 
@@ -127,33 +175,33 @@ class _Table:
 
     def numbers(self, field: int) -> list[int]:
         """A vector of 32-bit integers; empty where the field is missing."""
-        first, length = self._vector(field)
+        first, length = self.vector(field)
         return list(struct.unpack_from(f"<{length}i", self.data, first))
 
     def tables(self, field: int) -> list[_Table]:
         """A vector of tables; empty where the field is missing."""
-        first, length = self._vector(field)
+        first, length = self.vector(field)
+        if length > MOST_ENTRIES:
+            raise ValueError(f"a list of {length} entries")
         places = [first + 4 * index for index in range(length)]
         return [_Table(self.data, at + _number(self.data, "I", at)) for at in places]
 
     def text(self, field: int) -> str:
         """A text; empty where the field is missing."""
-        first, length = self._vector(field)
+        first, length = self.vector(field)
         return self.data[first : first + length].decode(errors="replace")
 
-    def _vector(self, field: int) -> tuple[int, int]:
-        """Where the elements of a vector begin, and how many there are."""
+    def vector(self, field: int) -> tuple[int, int]:
+        """Offset of the elements of a vector, and their number; 0, 0 where the field is missing."""
         at = self._place(field)
         if at is None:
             return 0, 0
         start = at + _number(self.data, "I", at)
         length = _number(self.data, "I", start)
-        if length > MOST_TENSORS:
-            raise ValueError(f"a list of {length} entries")
         return start + 4, length
 
     def _place(self, field: int) -> int | None:
-        """Where a field lies; None where it is missing. The table begins with the offset of its list of fields."""
+        """Offset of a field; None where it is missing. The table begins with the offset of its list of fields."""
         fields = self.position - _number(self.data, "i", self.position)
         slot = 4 + 2 * field
         if fields < 0:

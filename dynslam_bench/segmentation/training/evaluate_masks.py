@@ -92,10 +92,12 @@ class MaskTally:
               mean over the objects.
             - ``recall``: share of the objects that a detection covers with IoU >= 0.5.
         """
+        # what was gathered, one row a detection or object
         scores = np.array(self._scores)
         best = np.array(self._object_ious)
         hits = np.array(self._hits, bool).reshape(-1, len(THRESHOLDS))
         ignored = np.array(self._ignored, bool).reshape(-1, len(THRESHOLDS))
+        # average precision at each threshold, without the ignored detections
         precisions = []
         for k in range(len(THRESHOLDS)):
             counted = ~ignored[:, k]
@@ -144,6 +146,7 @@ def assign(
         For each detection, bool ``[10]`` at each of `THRESHOLDS`: whether it hits, and whether it
         is ignored.
     """
+    # at each threshold by itself
     count, objects = overlap.shape
     hits = np.zeros((count, len(THRESHOLDS)), bool)
     ignored = np.zeros((count, len(THRESHOLDS)), bool)
@@ -217,10 +220,12 @@ def _add_image(
     tallies: dict[str, MaskTally], segmenter: Segmenter, image: LabelledImage, index: int
 ) -> float:
     """Segment an image and add its masks to the tally of each class; returns the seconds that it took."""
+    # segment; the frame has no depth
     frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
     start = time.perf_counter()
     detections = segmenter.segment(frame)
     seconds = time.perf_counter() - start
+    # compare class by class
     for name, tally in tallies.items():
         labelled = image.masks[[kind == name for kind in image.class_names]]
         predicted = detections.of_classes([name])

@@ -151,6 +151,7 @@ def yolo_images(text: str) -> LabelledImages:
             names.
         SequenceError: ``data.yaml`` cannot be read.
     """
+    # the images and their labels
     folder = Path(text).expanduser()
     root = folder / "images"
     labels = folder / "labels"
@@ -193,6 +194,7 @@ def _yolo_names(path: Path) -> dict[int, str]:
 
 def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledImage:
     """An image and the polygons of its label file, which may be missing."""
+    # a polygon a line
     rgb = _read(path)
     masks = []
     names = []
@@ -272,6 +274,7 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         "COCO's are polygons or run lengths",
         of=(ValueError, TypeError, LookupError, OverflowError),
     ):
+        # polygons, else run lengths
         if isinstance(segmentation, list):
             return _fill([_polygon(points) for points in segmentation], shape)
         counts = segmentation["counts"]
@@ -300,11 +303,13 @@ def decode_runs(text: str) -> list[int]:
         ValueError: The text ends within a number, a number is longer than any image, or a character
             is no digit.
     """
+    # the whole text must be numbers of at most 13 digits
     rest = re.sub(rf"\A(?:{_NOT_LAST}{{0,12}}{_LAST})*", "", text, count=1)
     if rest:
         raise ValueError(
             f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}"
         )
+    # each number from its digits, then from a difference to a run
     runs: list[int] = []
     for number in re.findall(f"{_NOT_LAST}*{_LAST}", text):
         digits = [ord(character) - 48 for character in number]
@@ -414,7 +419,7 @@ def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
 
 
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
-"""How a set of labelled images is named."""
+"""Forms in which a set of labelled images is named."""
 
 
 def open_labelled(text: str) -> LabelledImages:

@@ -10,7 +10,7 @@ from dynslam_bench.core.settings import Settings
 
 
 class TrainSettings(Settings):
-    """How a Mask R-CNN is trained."""
+    """Training of a Mask R-CNN."""
 
     network: Literal["embedded", "resnet18", "resnet50"] = Field(
         "embedded",

@@ -200,10 +200,12 @@ class TrainingRun:
         report: Callable[[TrainProgress], object],
     ) -> TrainResult:
         """Learn until the last step."""
+        # refuse to begin without data
         settings = self.settings
         total = self.settings.iterations
         if not sum(map(len, sets)) or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
+        # steps, with an evaluation and a checkpoint now and then
         while self.step < total:
             losses = self._learn(batch_of(sets, settings, self.step))
             self.step += 1
@@ -367,6 +369,7 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
     best: list[float] = []
     counts = MaskCounts()
     for index in range(len(images)):
+        # the network's objects, with masks in the whole image
         example = images.example(index)
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255

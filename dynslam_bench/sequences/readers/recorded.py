@@ -80,7 +80,8 @@ class RecordedSequence:
         remarks: Phrases of that line that tell more than numbers of images and poses: files
             that were not used, a frame rate or a depth that nobody could mean.
         taken_for: Three lines on what the folder was taken for: images and rate; camera and depth
-            unit; ground truth, and all that was not taken as it stands.
+            unit; ground truth and numbers of what was not used. `remarks` are not repeated: the
+            table of the runs has them.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -158,10 +159,9 @@ class RecordedSequence:
             "" if self.ground_truth else "no ground truth",
             contents.truth_dropped,
             turned,
-            self._doubtful_truth(),
-            *self.remarks,
         ]
-        self.dropped = "; ".join(phrase for phrase in phrases if phrase)
+        doubtful = [self._doubtful_truth(), *self.remarks]
+        self.dropped = "; ".join(phrase for phrase in (*phrases, *doubtful) if phrase)
 
         # what the folder was taken for
         unit = "depth in metres"
@@ -179,10 +179,10 @@ class RecordedSequence:
         )
 
     def _doubtful_depth(self, depth: NDArray[np.float32]) -> str:
-        """A phrase where the first image's median depth is in no unit that its factor can mean; empty otherwise."""
+        """A phrase where the first image holds no depth, or one that its factor cannot mean; empty otherwise."""
         measured = depth[depth > 0]
         if not len(measured):
-            return ""
+            return "the first depth image holds no depth"
         median = float(np.median(measured))
         if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
             return ""
@@ -214,7 +214,7 @@ class RecordedSequence:
         return [people.files[i] for i in at]
 
     def _count_poses(self) -> dict[str, int]:
-        """How many poses the ground truth has, and how many frames have none."""
+        """Number of poses of the ground truth, and of frames that have none."""
         stamps = self.timestamps
         truth = self.ground_truth
         if truth is None:

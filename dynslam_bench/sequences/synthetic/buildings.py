@@ -244,6 +244,7 @@ _AROUND_ROOM = (
 
 def _rooms(building: _Building) -> Walk:
     """A corridor with three rooms on either side; the path runs once around in each and returns."""
+    # width and depth of the rooms, half the width of the corridor, half its length, metres
     rng = stream(building.scene, "synthetic", "floor")
     plan = plan_room(building.scene, 0)
     wide = pick(rng, building.scene, 6.6, 7.0)

@@ -25,7 +25,7 @@ MOTIONS = ("xyz", "static", "halfsphere", "rpy")
 EYE_HEIGHT_M = 1.35
 """Height of the camera at rest."""
 TILT_RAD = math.radians(10.0)
-"""How far it looks down."""
+"""Angle by which the camera looks down, radians."""
 _XYZ_M = (0.25, 0.2, 0.25)
 """Amplitudes of `xyz` to the right, down and forward."""
 _XYZ_PERIOD_S = 4.6
@@ -74,6 +74,7 @@ def _halfsphere(t: Array, tempo: float, sign: float) -> tuple[Array, Array]:
     """
     offset = np.zeros((len(t), 3))
     angles = np.zeros((len(t), 3))
+    # once around in 6.1 s, while the path rises and falls in 16.9 s; lengths in metres
     around = 2 * math.pi * t / (6.1 / tempo)
     lift = 0.5 - 0.5 * cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
     radius = 0.36
@@ -82,6 +83,7 @@ def _halfsphere(t: Array, tempo: float, sign: float) -> tuple[Array, Array]:
     offset[:, 0] = sign * radius * sin(around)
     offset[:, 1] = -radius * (0.85 * lift - 0.12) * cos(around * 0.5 + 0.3)
     offset[:, 2] = -0.1 + 0.2 * cos(around) * (0.4 + 0.6 * lift)
+    # turn towards what it looks at, nearly all the way, and roll
     angles[:, 1] = -0.9 * arctan2(offset[:, 0], distance - offset[:, 2])
     angles[:, 0] = 0.9 * arctan2(offset[:, 1], distance - offset[:, 2])
     angles[:, 2] = 0.2 * sin(around * 0.77 + 1.0)
@@ -96,21 +98,31 @@ def camera_axes(tilt: float) -> Array:
 
 def _swing_in_slot(t: Array, period: float, slot: int) -> Array:
     """One sine of `period` in this one of three slots, zero in the others, with no jump in position or speed."""
+    # share of the slot that has passed
     local = (t / period) % 3 - slot
     inside = (local >= 0) & (local < 1)
     x = np.clip(local, 0, 1)
     # The phase runs through x - sin(4 pi x) / (4 pi) * 0.5: slower at the start and the end of the
     # slot.
     eased = x - sin(2 * math.pi * x) / (2 * math.pi) * 0.6
+    # faded in and out over a tenth of the slot
     window = np.minimum(1.0, np.minimum(x, 1 - x) / 0.1)
     window = window * window * (3 - 2 * window)
     return np.where(inside, sin(2 * math.pi * eased) * window, 0.0)
 
 
 def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Array:
-    """Handheld jitter: sines from 0.2 to 4 Hz whose amplitude falls with the frequency."""
+    """Handheld jitter: sines from 0.2 to 4 Hz whose amplitude falls with the frequency.
+
+    Args:
+        rng: Draws frequencies and phases.
+        t: Seconds ``[N]``.
+        amplitude: Amplitude of the slowest sine, in the unit of the result.
+        axes: Number of axes.
+    """
     total = np.zeros((len(t), axes))
     for frequency in (0.23, 0.51, 0.97, 1.7, 2.6, 3.9):
+        # each axis has a frequency and a phase of its own
         f = frequency * (0.85 + 0.3 * rng.random(axes))
         turns = f * t[:, None] + rng.random(axes)
         total += amplitude * (0.5 / (0.4 + f)) * sin(2 * math.pi * turns)
@@ -119,6 +131,7 @@ def hand(rng: np.random.Generator, t: Array, amplitude: float, axes: int) -> Arr
 
 def rotations(vectors: Array) -> Array:
     """Rotation matrices ``[N, 3, 3]`` of rotation vectors ``[N, 3]`` (Rodrigues)."""
+    # angles and unit axes
     theta = norm(vectors)
     k = vectors / np.where(theta < 1e-12, 1.0, theta)[:, None]
     # Cross-product matrices of the axes.
@@ -127,6 +140,7 @@ def rotations(vectors: Array) -> Array:
     z = k[:, 2]
     zero = np.zeros(len(k))
     hat = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+    # R = I + sin(theta) [k] + (1 - cos(theta)) [k]^2
     s = sin(theta)[:, None, None]
     c = (1 - cos(theta))[:, None, None]
     return np.asarray(np.eye(3) + s * hat + c * (product(hat, hat)))

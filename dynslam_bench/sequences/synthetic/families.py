@@ -129,6 +129,7 @@ def _lane_keys(
 ) -> tuple[np.random.Generator, Person, tuple[Key, ...]]:
     """To and fro on a lane, with a stop in the middle where the person turns to the camera and talks."""
     rng = stream(scene, "synthetic", "crowd", number)
+    # where the person turns (m), how long they stop (s), where, and how long a crossing takes (s)
     side = 1.0 if number % 2 else -1.0
     reach = pick(rng, scene, 1.0, 1.45)
     pause = pick(rng, scene, 0.8, 2.0)
@@ -144,6 +145,7 @@ def _lane_keys(
         (cross, -side * reach, -side, 0.0),
         (0.6, -side * reach, side, 0.0),
     ]
+    # keys at the ends of these stretches; 180 degrees is towards the camera
     times = itertools.accumulate(station[0] for station in stations)
     keys = tuple(
         Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
@@ -169,18 +171,21 @@ DT_S = 0.05
 
 def _step(reach: float, period: float, phase: float, times: Array) -> Array:
     """To and fro, with rests at both ends."""
+    # flattened at both ends, where the person rests
     swing = sin(2 * math.pi * (times / period + phase))
     return np.asarray(reach * swing * (1.5 - 0.5 * swing * swing))
 
 
 def build_synchronous(scene: int) -> World:
     """The office, two people side by side, and a camera that moves with them."""
+    # the common motion: reach (m), period (s) and phase (turns)
     plan = plan_room(scene)
     rng = stream(scene, "synthetic", "synchronous")
     reach = pick(rng, scene, 0.5, 0.6)
     period = pick(rng, scene, 4.4, 5.2)
     phase = pick(rng, scene, 0.0, 1.0)
     step = partial(_step, reach, period, phase)
+    # two places in front of the camera (x, y in m), and who stands there
     left = (-pick(rng, scene, 0.3, 0.36), pick(rng, scene, 1.2, 1.3))
     right = (pick(rng, scene, 0.28, 0.34), 1.35)
     actors = tuple(
@@ -300,7 +305,7 @@ _LIGHT = 1.0, 0.1
 _ENTRY_S = 1.8
 """Time in which a person comes in or leaves."""
 _OUTSIDE_M = 3.0
-"""How far from their lane's end they wait outside."""
+"""Distance from their lane's end at which they wait outside, metres."""
 
 
 @dataclass(frozen=True)
@@ -324,6 +329,7 @@ class Ramp:
 
     def integral(self, times: Array) -> Array:
         """The integral of the level from 0 to each time, seconds."""
+        # time after the change begins, and share of the change that has passed
         since = np.maximum(times - self.at_s, 0.0)
         x = np.minimum(since / _CHANGE_S, 1.0)
         # The time after the change, and the integral of `ease` during it.
@@ -341,16 +347,19 @@ def build_changing(name: str, scene: int) -> World:
     motion = "halfsphere" if name == "tempo" else "xyz"
     camera = partial(camera_poses, motion, "changing", scene)
     world = World(build_room(scene, plan), camera, glare_window(plan))
+    # the people come one after the other
     if name == "crowd":
         visitors = [
             _visitor(scene, k, lane, at_s + 0.3 * k, order > 0) for k, lane in enumerate(LANES_M)
         ]
         return replace(world, actors=tuple(visitors))
+    # the camera's time runs faster or slower after the change
     if name == "tempo":
         tempo = Ramp(at_s, *_TEMPO[::order])
         return replace(
             world, camera=lambda times: camera(tempo.integral(np.asarray(times, dtype=np.float64)))
         )
+    # the light
     return replace(world, optics=Optics(gain=Ramp(at_s, *_LIGHT[::order]).level))
 
 
@@ -450,6 +459,7 @@ def build_fast(variant: str, scene: int) -> World:
 
 def fast_camera(variant: str, scene: int, times: Array) -> Array:
     """Poses ``[N, 4, 4]``: sines of several frequencies along and about all axes; `spin` also turns round and round."""
+    # jitter of the hand
     rng = stream(scene, "synthetic", "camera", "fast", variant)
     t = times
     shifts, turns = SWINGS[variant]
@@ -462,6 +472,7 @@ def fast_camera(variant: str, scene: int, times: Array) -> Array:
             second = pick(rng, scene, 0.8, 1.1)
             values[:, axis] += 0.75 * amplitude * sin(2 * math.pi * (main * t + rng.random()))
             values[:, axis] += 0.4 * amplitude * sin(2 * math.pi * (second * t + rng.random()))
+    # round and round, and from where it looks
     yaw = np.zeros((len(t), 3))
     place = np.array([0.0, 0.0, EYE_HEIGHT_M])
     if variant == "spin":

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import Scalar, dividing_kernel
+from dynslam_bench.core.compiled import Scalar, dividing_kernel, inlined_statements
 from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
 from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
 from dynslam_bench.sequences.synthetic.textures import TextureAtlas
@@ -140,7 +140,15 @@ def hit_box(origin: Vector, direction: Vector, half: Vector, t_max: float) -> tu
 
 @dividing_kernel
 def hit_sphere(origin: Vector, direction: Vector, dd: float, r: float, best: float) -> float:
-    """Nearest hit with a sphere about the origin if it is before `best`, else that; dd is the direction's square."""
+    """Depth of the nearest hit with a sphere about the origin if it is before `best`, else that.
+
+    Args:
+        origin: Origin of the ray, metres from the sphere's centre.
+        direction: Direction of the ray, of depth 1.
+        dd: Squared length of the direction.
+        r: Radius, metres.
+        best: Depth of the nearest hit so far.
+    """
     ox, oy, oz = origin
     dx, dy, dz = direction
     # |o + t d|^2 = r^2, by half the linear coefficient
@@ -200,7 +208,16 @@ def hit_round_cone(origin: Vector, direction: Vector, shape: Vector, t_max: floa
 def hit_primitive(
     kind: int, origin: Vector, direction: Vector, shape: Vector, t_max: float
 ) -> tuple[float, int]:
-    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
+    """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one.
+
+    Args:
+        kind: `BOX`, `ROUND_CONE` or a quad.
+        origin: Origin of the ray in the primitive's frame.
+        direction: Direction of the ray, of depth 1.
+        shape: Half extents, or height and two radii of a round cone.
+        t_max: Hits from here on do not count.
+    """
+    # a round cone has one face
     if kind == ROUND_CONE:
         t = hit_round_cone(origin, direction, shape, t_max)
         return t, 0 if t < t_max else -1
@@ -243,6 +260,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
             for tx in range(boxes[p, 0], boxes[p, 2] + 1):
                 start[ty * tiles_x + tx + 1] += 1
     start = np.cumsum(start).astype(np.int32)
+    # where the next member of each tile is written
     fill = start[:-1].copy()
     members = np.empty(start[-1], np.int32)
     for n in range(order.shape[0]):
@@ -290,6 +308,7 @@ def cast_geometry(
         y = (row - cy) / fy
         last = -1
         for column in range(width):
+            # candidates of the pixel's tile
             tile = (row // TILE) * tiles_x + column // TILE
             first = start[tile]
             end = start[tile + 1]
@@ -323,6 +342,7 @@ def cast_geometry(
                     t = t_hit
                     p = q
                     face = face_hit
+            # what the pixel sees
             last = p
             hit[row, column] = 8 * p + face if p >= 0 else -1
             depth[row, column] = t if p >= 0 else 0.0
@@ -362,6 +382,172 @@ def mip_level(footprint: float, log2_size: int) -> tuple[int, float]:
         footprint *= 0.25
         level += 1
     return level, min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
+
+
+# Parts of `shade_pixels`, whose statements numba copies into it: arrays that are passed cost nothing.
+
+
+@inlined_statements
+def lies_on_edge(hit: Ints, row: int, column: int) -> bool:
+    """Whether one of a pixel's four neighbours shows another surface; `hit` as in `cast_geometry`."""
+    height, width = hit.shape
+    surface = hit[row, column]
+    return (
+        (column > 0 and hit[row, column - 1] != surface)
+        or (column + 1 < width and hit[row, column + 1] != surface)
+        or (row > 0 and hit[row - 1, column] != surface)
+        or (row + 1 < height and hit[row + 1, column] != surface)
+    )
+
+
+@inlined_statements
+def light_round_cone(
+    p: int, local: Vector, ray: Vector, maps: Reals, shape: Reals, uv: Reals, lights: Reals
+) -> tuple[float, float, float, float]:
+    """Texture coordinates u, v, cosine of incidence and light (Lambert's law) at a point of a round cone.
+
+    Args:
+        p: The primitive.
+        local: The point in the primitive's frame, metres.
+        ray: x and y of the ray of depth 1 in the camera frame, and its length.
+        maps: ``[P, 12]``, see `Primitives.camera_to_local`.
+        shape: See `Primitives`.
+        uv: See `Materials`.
+        lights: See `shade_pixels`.
+    """
+    lx, ly, lz = local
+    x, y, norm = ray
+    # u runs around the axis, v along it
+    u = uv[p, 0, 2]
+    v = uv[p, 0, 3]
+    u += atan2(lx, ly) * _PER_TURN * uv[p, 0, 0]
+    v -= lz * uv[p, 0, 1]
+    # Normal into the camera frame: transpose of the linear part of (camera to local).
+    extent = (shape[p, 0], shape[p, 1], shape[p, 2])
+    nz = round_cone_normal_z(lz, extent)
+    nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
+    nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
+    nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
+    # cosine of incidence, and the ambient light plus that of each lamp the normal faces
+    inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
+    cos = abs(nu * x + nv * y + nw) * inv / norm
+    light = lights[0, 3]
+    for i in range(1, lights.shape[0]):
+        facing = (nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]) * inv
+        if facing > 0.0:
+            light += facing * lights[i, 3]
+    return u, v, cos, light
+
+
+@inlined_statements
+def light_flat_face(
+    p: int, face: int, local: Vector, ray: Vector, uv: Reals, facets: Reals
+) -> tuple[float, float, float, float]:
+    """Texture coordinates u, v, cosine of incidence and light at a point of a box or a quad.
+
+    Args:
+        p: The primitive.
+        face: The face, see `hit_box`; 4 of a quad.
+        local: The point in the primitive's frame, metres.
+        ray: x and y of the ray of depth 1 in the camera frame, and its length.
+        uv: See `Materials`.
+        facets: See `Materials`.
+    """
+    lx, ly, lz = local
+    x, y, norm = ray
+    # normal and light are the same all over a flat face
+    along_ray = facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
+    cos = abs(along_ray) / norm
+    light = facets[p, face, 3]
+    repeats_u = uv[p, face, 0]
+    repeats_v = uv[p, face, 1]
+    u = uv[p, face, 2]
+    v = uv[p, face, 3]
+    if face < 4:
+        # upright faces: v runs down, u to the right as seen from outside
+        side = repeats_u if (face & 1) else -repeats_u
+        u += ly * side if face < 2 else -lx * side
+        v -= lz * repeats_v
+    else:
+        # faces that look up or down, and quads
+        u += lx * repeats_u
+        v -= ly * repeats_v
+    return u, v, cos, light
+
+
+@inlined_statements
+def filter_texture(
+    texels: NDArray[np.uint8],
+    level_offset: Ints,
+    log2_size: Ints,
+    number: int,
+    u: float,
+    v: float,
+    footprint: float,
+    light: float,
+) -> tuple[float, float, float]:
+    """Red, green and blue of a texture in a light, by trilinear filtering: bilinear samples of two mip levels.
+
+    Args:
+        texels: See `TextureAtlas`, as for the next two.
+        level_offset: Where each mip level begins.
+        log2_size: Size of each texture.
+        number: Number of the texture.
+        u: Texture coordinate; the texture is 1 wide, and wraps around.
+        v: Texture coordinate along the other axis.
+        footprint: Square of the texels that the pixel covers at the finest level.
+        light: Factor on the colour.
+    """
+    # unsigned: an index that may be negative costs a test
+    one = np.uint64(1)
+    two = np.uint64(2)
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    log2 = log2_size[number]
+    level, blend = mip_level(footprint, log2)
+    u -= math.floor(u)
+    v -= math.floor(v)
+    for upper in range(2 if blend > 0.0 else 1):
+        bits = log2 - level - upper
+        size = 1 << bits
+        base = level_offset[number, level + upper]
+        # positive, so that int() floors
+        fu = u * size + (size - 0.5)
+        fv = v * size + (size - 0.5)
+        iu = int(fu)
+        iv = int(fv)
+        au = fu - iu
+        av = fv - iv
+        # the four texels around the point; the texture wraps around
+        u0 = iu & (size - 1)
+        v0 = (iv & (size - 1)) << bits
+        u1 = (iu + 1) & (size - 1)
+        v1 = ((iv + 1) & (size - 1)) << bits
+        a = np.uint64(base + ((v0 + u0) << 2))
+        b = np.uint64(base + ((v0 + u1) << 2))
+        c = np.uint64(base + ((v1 + u0) << 2))
+        d = np.uint64(base + ((v1 + u1) << 2))
+        # bilinear weights, times the light and the share of this mip level
+        weight = light * (blend if upper else 1.0 - blend)
+        wa = (1.0 - au) * (1.0 - av) * weight
+        wb = au * (1.0 - av) * weight
+        wc = (1.0 - au) * av * weight
+        wd = au * av * weight
+        red += wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d]
+        green += (
+            wa * texels[a + one]
+            + wb * texels[b + one]
+            + wc * texels[c + one]
+            + wd * texels[d + one]
+        )
+        blue += (
+            wa * texels[a + two]
+            + wb * texels[b + two]
+            + wc * texels[c + two]
+            + wd * texels[d + two]
+        )
+    return red, green, blue
 
 
 @dividing_kernel
@@ -406,23 +592,14 @@ def shade_pixels(
     kind, camera_to_local, shape = primitives
     texture, uv, tint, facets = materials
     texels, level_offset, log2_size = atlas
-    height, width = hit.shape
+    width = hit.shape[1]
     samples = jitter.shape[0]
     sample_weight = 1.0 / samples
-    # unsigned: an index that may be negative costs a test
-    one = np.uint64(1)
-    two = np.uint64(2)
     for row in range(row0, row1):
         maps = camera_to_local[row % len(camera_to_local)]
         for column in range(width):
-            # A pixel lies on an edge if one of its four neighbours shows another surface.
             centre_surface = hit[row, column]
-            edge = (
-                (column > 0 and hit[row, column - 1] != centre_surface)
-                or (column + 1 < width and hit[row, column + 1] != centre_surface)
-                or (row > 0 and hit[row - 1, column] != centre_surface)
-                or (row + 1 < height and hit[row + 1, column] != centre_surface)
-            )
+            edge = lies_on_edge(hit, row, column)
             # sum of the samples
             red = 0.0
             green = 0.0
@@ -499,97 +676,20 @@ def shade_pixels(
                     ly = maps[p, 7] + t * (maps[p, 4] * x + maps[p, 5] * y + maps[p, 6])
                     lz = maps[p, 11] + t * (maps[p, 8] * x + maps[p, 9] * y + maps[p, 10])
                     norm = math.sqrt(x * x + y * y + 1.0)
-                    # Texture coordinates, cosine of incidence and light (Lambert's law).
-                    repeats_u = uv[p, face, 0]
-                    repeats_v = uv[p, face, 1]
-                    u = uv[p, face, 2]
-                    v = uv[p, face, 3]
+                    # Texture coordinates, cosine of incidence and light.
+                    local = (lx, ly, lz)
+                    ray = (x, y, norm)
                     if kind[p] == ROUND_CONE:
-                        # u runs around the axis, v along it
-                        u += atan2(lx, ly) * _PER_TURN * repeats_u
-                        v -= lz * repeats_v
-                        # Normal into the camera frame: transpose of the linear part of (camera to
-                        # local).
-                        extent = (shape[p, 0], shape[p, 1], shape[p, 2])
-                        nz = round_cone_normal_z(lz, extent)
-                        nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
-                        nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
-                        nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
-                        # cosine of incidence, and the ambient light plus that of each lamp the normal faces
-                        inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
-                        cos = abs(nu * x + nv * y + nw) * inv / norm
-                        light = lights[0, 3]
-                        for i in range(1, lights.shape[0]):
-                            facing = (
-                                nu * lights[i, 0] + nv * lights[i, 1] + nw * lights[i, 2]
-                            ) * inv
-                            if facing > 0.0:
-                                light += facing * lights[i, 3]
+                        u, v, cos, light = light_round_cone(p, local, ray, maps, shape, uv, lights)
                     else:
-                        # normal and light are the same all over a flat face
-                        along_ray = (
-                            facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
-                        )
-                        cos = abs(along_ray) / norm
-                        light = facets[p, face, 3]
-                        if face < 4:
-                            # upright faces: v runs down, u to the right as seen from outside
-                            side = repeats_u if (face & 1) else -repeats_u
-                            u += ly * side if face < 2 else -lx * side
-                            v -= lz * repeats_v
-                        else:
-                            u += lx * repeats_u
-                            v -= ly * repeats_v
+                        u, v, cos, light = light_flat_face(p, face, local, ray, uv, facets)
                     # Texel footprint squared, between those along and across a slanted surface.
-                    tex = texture[p, face]
-                    log2 = log2_size[tex]
                     footprint = facets[p, face, 4] * t
                     footprint = footprint * footprint / max(cos, 0.05)
-                    # Trilinear filtering: bilinear samples of two mip levels.
-                    level, blend = mip_level(footprint, log2)
-                    u -= math.floor(u)
-                    v -= math.floor(v)
-                    for upper in range(2 if blend > 0.0 else 1):
-                        bits = log2 - level - upper
-                        size = 1 << bits
-                        base = level_offset[tex, level + upper]
-                        # positive, so that int() floors
-                        fu = u * size + (size - 0.5)
-                        fv = v * size + (size - 0.5)
-                        iu = int(fu)
-                        iv = int(fv)
-                        au = fu - iu
-                        av = fv - iv
-                        # the four texels around the point; the texture wraps around
-                        u0 = iu & (size - 1)
-                        v0 = (iv & (size - 1)) << bits
-                        u1 = (iu + 1) & (size - 1)
-                        v1 = ((iv + 1) & (size - 1)) << bits
-                        a = np.uint64(base + ((v0 + u0) << 2))
-                        b = np.uint64(base + ((v0 + u1) << 2))
-                        c = np.uint64(base + ((v1 + u0) << 2))
-                        d = np.uint64(base + ((v1 + u1) << 2))
-                        # bilinear weights, times the light and the share of this mip level
-                        weight = light * (blend if upper else 1.0 - blend)
-                        wa = (1.0 - au) * (1.0 - av) * weight
-                        wb = au * (1.0 - av) * weight
-                        wc = (1.0 - au) * av * weight
-                        wd = au * av * weight
-                        last_red += (
-                            wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d]
-                        )
-                        last_green += (
-                            wa * texels[a + one]
-                            + wb * texels[b + one]
-                            + wc * texels[c + one]
-                            + wd * texels[d + one]
-                        )
-                        last_blue += (
-                            wa * texels[a + two]
-                            + wb * texels[b + two]
-                            + wc * texels[c + two]
-                            + wd * texels[d + two]
-                        )
+                    # Colour of the texture in this light, times the primitive's tint.
+                    last_red, last_green, last_blue = filter_texture(
+                        texels, level_offset, log2_size, texture[p, face], u, v, footprint, light
+                    )
                     last_red = last_red * tint[p, 0]
                     last_green = last_green * tint[p, 1]
                     last_blue = last_blue * tint[p, 2]
@@ -626,7 +726,7 @@ _SHORTEST_BLUR_PX = 0.75
 
 
 def tap_shares() -> Reals:
-    """Where along a blur each of its taps lies, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
+    """Places of a blur's taps, as shares of its length from the middle: ``[n, i]`` for tap i of n."""
     taps = np.arange(MOST_TAPS + 1)[:, None]
     i = np.arange(MOST_TAPS)[None]
     return np.where(i < taps, (i + 0.5) / np.maximum(taps, 1) - 0.5, 0.0)
@@ -644,14 +744,23 @@ def flow_field(
 ) -> None:
     """Exact optical flow (float32 pixels) of rows.
 
-    ``motion`` [P, 12] takes a point in this camera's frame, fixed to primitive p, to the other
-    camera's frame. Where nothing is hit or the point leaves the front of the camera, the flow is
-    NaN.
+    Where nothing is hit or the point leaves the front of the camera, the flow is NaN.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        intrinsics: The camera.
+        hit: int32 ``[H, W]``, see `cast_geometry`.
+        depth: float64 ``[H, W]``, see `cast_geometry`.
+        motion: ``[P, 12]``, row-major 3x4 transforms of a point fixed to each primitive, from this
+            camera's frame to the other camera's.
+        flow: float32 ``[H, W, 2]``, filled.
     """
     fx, fy, cx, cy = intrinsics
     width = hit.shape[1]
     for row in range(row0, row1):
         for column in range(width):
+            # no flow, unless a point is seen
             flow[row, column, 0] = flow[row, column, 1] = np.nan
             # unproject
             p = hit[row, column] >> 3
@@ -680,8 +789,17 @@ def motion_blur(
 ) -> None:
     """Average the colour of rows along the pixel's own flow over `shutter` of a frame interval, centred.
 
-    ``exact`` is the whole colour image as flat float64: what all taps read is converted once.
-    ``shares`` are `tap_shares`. Unsigned indices need no test for negative ones.
+    Unsigned indices need no test for negative ones.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        color: float32 ``[H, W, 3]``, the sharp colours.
+        exact: These colours as flat float64: what all taps read is converted once.
+        shares: Places of the taps, `tap_shares`.
+        flow: float32 ``[H, W, 2]`` to the next frame, pixels.
+        shutter: Share of the frame interval for which the shutter is open.
+        blurred: float32 ``[H, W, 3]``, filled.
     """
     height, width = color.shape[:2]
     # taps stay where a texel to the right and one below exist
@@ -815,6 +933,7 @@ def _mark_projector_shadow(
         if z <= 0.0:
             in_shadow[u] = True
             continue
+        # the column of the projector that lights the point
         column = u + fx_baseline / z
         in_shadow[u] = column >= leftmost + 0.5
         leftmost = min(leftmost, column)
@@ -822,8 +941,16 @@ def _mark_projector_shadow(
 
 @dividing_kernel
 def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, float]:
-    """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below."""
+    """The least and the greatest depth of a pixel and of those `reach` away on either side, above and below.
+
+    Args:
+        depth: Exact z-depth ``[H, W]``, metres, 0 for nothing.
+        row: Row of the pixel.
+        u: Column of the pixel.
+        reach: Pixels.
+    """
     height, width = depth.shape
+    # the pixel itself, then the four others that have a depth
     lowest = depth[row, u]
     highest = depth[row, u]
     for down, right in ((0, -reach), (0, reach), (-reach, 0), (reach, 0)):
@@ -920,7 +1047,18 @@ def expose(
     shot_noise: float,
     out: Ints,
 ) -> None:
-    """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping."""
+    """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        seed: Seed of this frame's noise.
+        color: Colour ``[H, W, 3]`` from 0 to 255.
+        gain: Factor of each row ``[H]``.
+        read_noise: Standard deviation of the noise without light, grey levels.
+        shot_noise: Variance of the noise a grey level of signal.
+        out: uint8 ``[H, W, 3]``, filled.
+    """
     width = color.shape[1]
     for row in range(row0, row1):
         for u in range(width):

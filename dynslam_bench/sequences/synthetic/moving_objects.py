@@ -78,6 +78,7 @@ def _body(
 
 def _balloon(draw: Draw, scene: int, plan: RoomPlan) -> Script:
     """A person walks to and fro and plays with a balloon in front of the camera."""
+    # distance from the camera, half the way from side to side, and height of a throw, metres
     y = draw(0.95, 1.05)
     reach = draw(0.32, 0.42)
     high = draw(1.45, 1.55)
@@ -89,6 +90,7 @@ def _balloon(draw: Draw, scene: int, plan: RoomPlan) -> Script:
         up = At(2.5 * k + 0.9, 0.3 * side * reach, y - 0.1, high + 0.12, 60.0 * k)
         down = At(2.5 * k + 2.5, side * reach, y, high - 0.3, 60.0 * k + 30.0)
         keys += [up, down]
+    # the person follows the balloon, behind it
     walker = [Key(k.t, 1.1 * k.x, y + 0.55, 180.0 - 15.0 * np.sign(k.x), 0, 1) for k in keys[::2]]
     toy = balloon(1, draw(0.17, 0.2))
     return Script((_body(1, "sports ball", toy, tuple(keys)),), tuple(walker))

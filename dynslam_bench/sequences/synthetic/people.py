@@ -206,7 +206,7 @@ class _Figure:
             self.knee_angles.append(walking_knee * (1 - sit) + sit * (1.35 + 0.12 * side))
 
     def _pelvis_position(self, body: Array) -> Array:
-        """Where the pelvis is: above the lower foot or on the seat, and swaying where the person stands."""
+        """Position of the pelvis: above the lower foot or on the seat, and swaying where the person stands."""
         how = self.how
         k = self.size
         # height over the foot of each leg, by the lengths of thigh and shin
@@ -230,6 +230,7 @@ class _Figure:
 
         Who sits leans back: arms and head go on, the trunk hardly moves.
         """
+        # shares of walking, sitting and gesturing, 0 to 1, weigh the movements; angles in radians
         gait = self.how.gait
         sit = self.how.sit
         gesture = self.how.gesture
@@ -242,6 +243,8 @@ class _Figure:
             + supple * (0.02 * wave(0.19, 1.0) + gesture * 0.04 * wave(0.43, 0.2))
         )
         tilt = 0.02 * supple * wave(0.17, 0.7)
+
+        # pelvis and trunk turn against each other
         self.trunk = product(body, _yaw(twist), _pitch(-lean), _roll(tilt))
         self.hips = product(body, _yaw(-twist))
 
@@ -299,6 +302,7 @@ def build_person(who: Person, how: Posture) -> Primitives:
 
 def _trunk(figure: _Figure) -> Primitives:
     """Pelvis, belly and chest, shoulders; wider than deep."""
+    # factors on lengths and widths of a person of 1.75 m, for this one's height and build
     k = figure.size
     b = figure.build
     trunk = figure.trunk
@@ -337,6 +341,7 @@ def _trunk(figure: _Figure) -> Primitives:
 
 def _head(figure: _Figure) -> Primitives:
     """Neck and head, which looks about, with its hair and cap."""
+    # factor on lengths of a person of 1.75 m, and where the skull is
     k = figure.size
     trunk = figure.trunk
     neck = figure.neck
@@ -428,6 +433,7 @@ def _arm_angles(figure: _Figure, side: int) -> tuple[float, float, float]:
 
 def _arm(figure: _Figure, side: int) -> Primitives:
     """Upper arm, forearm, hand and thumb of the left (-1) or right (1) side."""
+    # factors on lengths and widths of a person of 1.75 m, for this one's height and build
     k = figure.size
     b = figure.build
     pitch, abduction, bend = _arm_angles(figure, side)
@@ -465,6 +471,7 @@ def _arm(figure: _Figure, side: int) -> Primitives:
 
 def _leg(figure: _Figure, side: int, index: int) -> Primitives:
     """Thigh, shin and shoe of the left (-1, index 0) or right (1, index 1) side."""
+    # factors on lengths and widths, and the leg's angles in radians
     k = figure.size
     b = figure.build
     sit = figure.how.sit

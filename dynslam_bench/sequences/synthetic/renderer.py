@@ -51,7 +51,7 @@ _MARGIN_PX = 2.0
 _SAMPLED_ROWS = 9
 """Rows of a rolling shutter by whose poses primitives are sorted into tiles."""
 _SLACK_M = 0.01
-"""How much nearer than in the sampled rows a primitive may be in another one."""
+"""Metres by which a primitive may be nearer in another row than in the sampled ones."""
 
 _LAMPS = np.array(
     [[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]]
@@ -128,7 +128,7 @@ _EDGES = np.array(
 
 
 def bounds_of(corners: Array) -> Array:
-    """Where in the image boxes can be seen: around the parts of them that lie before the camera.
+    """Bounds of boxes in the image: around the parts of them that lie before the camera.
 
     Args:
         corners: ``[P, 8, 3]`` in the camera frame, metres.
@@ -181,6 +181,7 @@ class Renderer:
     def __init__(
         self, sequence: SyntheticId, scene: Scene, settings: RenderSettings, threads: int
     ) -> None:
+        # sensors of this world, and a seed of noise that its id alone decides
         self.settings = settings
         self.scene = scene
         self.threads = threads
@@ -307,6 +308,7 @@ class Renderer:
         time: float,
     ) -> tuple[ColorImage, NDArray[np.float32]]:
         """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
+        # images that the bands fill
         scene = self.scene
         texel_density = self._texel_density
         color = np.empty((*SIZE, 3), np.float32)
@@ -382,12 +384,14 @@ class Renderer:
 
     def _lights(self, pose: Array, time: float) -> Array:
         """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
+        # unit directions in the world
         rows = _LAMPS.copy()
         rows[:, :3] /= norm(rows[:, :3])[:, None]
         # all dim and brighten slowly, one lamp switches
         if self.settings.lighting_change:
             rows[:, 3] *= 0.78 + 0.22 * cos(2 * math.pi * time / 7.0)
             rows[2, 3] += 0.25 if sin(2 * math.pi * time / 4.7) > 0.3 else 0.0
+        # into the camera frame
         rows[:, :3] = product(rows[:, :3], pose[:3, :3])
         return rows
 
@@ -441,6 +445,7 @@ class Renderer:
         up = (_SHADOW_PLANE_M - wz) / direction[2]
         wx = wx + direction[0] * up
         wy = wy + direction[1] * up
+        # darker towards the middle of each spot
         factor = np.ones(SIZE)
         for spot_x, spot_y, radius, darkness in (first, second):
             near = 1.0 - ((wx - spot_x) ** 2 + (wy - spot_y) ** 2) / (radius * radius)
@@ -449,11 +454,13 @@ class Renderer:
 
     def _glare(self, pose: Array, time: float) -> NDArray[np.float32]:
         """A bright veil ``[H, W, 1]`` around a window beside the back wall, brightening and fading."""
+        # the window in the image
         x, y, z = product(np.array(self.scene.world.window) - pose[:3, 3], pose[:3, :3])
         if z <= 0.1:
             return np.zeros((*SIZE, 1), np.float32)
         u = x / z * CAMERA.fx + CAMERA.cx
         v = y / z * CAMERA.fy + CAMERA.cy
+        # a Gaussian around it along both axes, as bright as the time says
         strength = 110 * (0.6 + 0.4 * sin(2 * math.pi * time / 5.3))
         across = exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
         down = exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))

@@ -185,6 +185,7 @@ def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Pr
     """A pile of books at either end."""
     parts: Primitives = []
     for k in range(2):
+        # two to four books, each turned a little on the one below
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
             shade = 0.25 + 0.7 * rng.random(3)

@@ -144,7 +144,7 @@ class View:
 
 
 def row_times(index: int, readout_s: float) -> Array:
-    """When each row of frame `index` is exposed, seconds from the start; the image's middle at the frame's stamp."""
+    """Times when frame `index` exposes its rows, seconds from the start; the image's middle at its stamp."""
     rows = (np.arange(CAMERA.height) + 0.5) / CAMERA.height - 0.5
     return index / FPS + rows * readout_s
 
@@ -188,7 +188,7 @@ class Scene:
         # neighbouring frames ask for the same places and views
         self._placed = lru_cache(maxsize=8)(self._place)
         self.view = lru_cache(maxsize=8)(self._view)
-        """How frame `index` sees the scene."""
+        """The scene as frame `index` sees it."""
 
     @cached_property
     def atlas(self) -> textures.TextureAtlas:
@@ -226,7 +226,7 @@ class Scene:
         return rotation, origin
 
     def _view(self, index: int) -> View:
-        """How frame `index` sees the scene; things stand still while its rows are read."""
+        """The scene as frame `index` sees it; things stand still while its rows are read."""
         time = index / FPS
         readout_s = self.world.optics.readout_s
         pose = self.world.camera(np.array([time]))[0]

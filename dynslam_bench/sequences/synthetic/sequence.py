@@ -89,7 +89,7 @@ class FrameStore:
         self.camera = camera
 
     def path(self, kind: str, stamp: float) -> Path:
-        """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
+        """Path of a frame's image of a kind (``rgb``, ``depth``, ``masks``)."""
         return self.folder / kind / f"{stamp:.6f}.png"
 
     def bytes_of(self, kind: str, stamp: float) -> bytes | None:

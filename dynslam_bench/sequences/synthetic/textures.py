@@ -42,6 +42,7 @@ def build_atlas(textures: list[Image]) -> TextureAtlas:
     parts: list[NDArray[np.uint8]] = []
     position = 0
     for index, image in enumerate(textures):
+        # halve the image until one texel is left
         log2_size[index] = len(image).bit_length() - 1
         current = np.clip(image, 0, 255)
         for level in range(_LEVELS):
@@ -63,7 +64,14 @@ def build_atlas(textures: list[Image]) -> TextureAtlas:
 def smooth_noise(
     rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None
 ) -> NDArray[np.float64]:
-    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, smoothly blended."""
+    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, smoothly blended.
+
+    Args:
+        rng: Draws the lattice.
+        size: Edge of the texture, texels.
+        cells: Cells along u.
+        cells_v: Cells along v; None for as many.
+    """
     cells_v = cells if cells_v is None else cells_v
     lattice = rng.random((cells_v, cells)) * 2 - 1
 
@@ -255,7 +263,7 @@ def plaid(rng: np.random.Generator, size: int = 256) -> Image:
     t = (np.arange(size) * repeats / size) % 1.0
 
     def bands() -> NDArray[np.float64]:
-        """Where along one axis the second and the third colour have their bands ``[S, 2]``."""
+        """Bands of the second and the third colour along one axis ``[S, 2]``."""
         centres = rng.random(3)
         widths = 0.05 + 0.12 * rng.random(3)
         weight = np.zeros((size, 2))
@@ -305,6 +313,7 @@ def stripes(rng: np.random.Generator, size: int = 256) -> Image:
     image = np.tile(first, (size, size, 1))
     v = 0
     while v < size:
+        # a stripe, then a gap, pixels
         w = int(rng.integers(8, 22))
         gap = int(rng.integers(8, 26))
         image[v : v + w] = second
@@ -325,6 +334,7 @@ def hair(rng: np.random.Generator, size: int = 128) -> Image:
 
 def face(rng: np.random.Generator, size: int = 256) -> Image:
     """A face, unrolled: u = 0.5 is the front, v from the crown (0) to the chin (1); to be tinted with the skin."""
+    # pale skin, slightly uneven
     image = (
         np.tile(np.array([240.0, 236.0, 232.0]), (size, size, 1))
         + 4 * fractal(rng, size, 8, 3)[..., None]

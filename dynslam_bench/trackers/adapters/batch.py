@@ -136,7 +136,7 @@ class BatchTracker:
             )
 
         # read the trajectory, if it is of this run
-        self._check_own(output)
+        self._check_written_now(output)
         try:
             trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
@@ -185,7 +185,7 @@ class BatchTracker:
             self._folder.close()
             self._folder = None
 
-    def _check_own(self, output: Path) -> None:
+    def _check_written_now(self, output: Path) -> None:
         """Refuse a trajectory that the program did not write in this run.
 
         Raises:

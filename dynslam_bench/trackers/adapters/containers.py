@@ -123,6 +123,7 @@ class Container:
         variables: Mapping[str, str],
         alive: Path,
     ) -> list[str]:
+        """The command of docker or podman; arguments as of `command`."""
         command = [engine, "run", "--rm", "--interactive", "--network", "none"]
 
         # files belong to this user
@@ -163,6 +164,7 @@ class Container:
         writable: Iterable[Path],
         variables: Mapping[str, str],
     ) -> list[str]:
+        """The command of apptainer; arguments as of `command`."""
         command = ["apptainer", "exec", "--cleanenv", "--no-home"]
         if self.gpu:
             command.append("--nv")

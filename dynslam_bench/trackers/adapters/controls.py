@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import Camera, load_tum, se3
+from dynslam_bench.geometry.motion_covariances import read_motion_covariances
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
 MAX_CORNERS = 400
@@ -167,6 +168,9 @@ class Replay:
         self.settings = settings
         file = load_tum(Path(settings.file).expanduser())
         self._trajectory = file.trajectory
+        self._covariances = None
+        if settings.covariances:
+            self._covariances = read_motion_covariances(settings.covariances)
         self.measured = {"notes": file.notes.describe()}
         """``notes``: what of the file was not taken as it stands."""
 
@@ -183,5 +187,17 @@ class Replay:
         if gap > self.settings.tolerance_s + 1e-9:
             return TrackResult(T_world_cam=None, state="lost", stats=stats)
         return TrackResult(
-            T_world_cam=self._trajectory.T_world_cam[nearest].copy(), state="ok", stats=stats
+            T_world_cam=self._trajectory.T_world_cam[nearest].copy(),
+            state="ok",
+            stats=stats,
+            motion_covariance=self._covariance_at(float(stamps[nearest])),
         )
+
+    def _covariance_at(self, stamp: float) -> NDArray[np.float64] | None:
+        """The covariance of the motion to the pose of a stamp; None where the file has none."""
+        if self._covariances is None:
+            return None
+        gaps = np.abs(self._covariances.timestamps - stamp)
+        nearest = int(np.argmin(gaps))
+        # files hold stamps to the microsecond at least
+        return self._covariances.matrices[nearest].copy() if gaps[nearest] < 1e-6 else None

@@ -26,7 +26,7 @@ MAX_FAILURES = 5
 INSTALL = (
     "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
 )
-"""How to get an OpenCV with RGB-D odometry."""
+"""Advice on getting an OpenCV with RGB-D odometry."""
 
 
 class FrameToFrame(ABC):
@@ -94,7 +94,7 @@ class FrameToFrame(ABC):
 
 
 def unavailable() -> str:
-    """How to get an OpenCV with RGB-D odometry; empty if this one has it."""
+    """Advice on getting an OpenCV with RGB-D odometry; empty if this one has it."""
     if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd"):
         return ""
     return f"OpenCV {cv2.__version__} lacks it: {INSTALL}"

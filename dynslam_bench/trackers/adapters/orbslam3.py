@@ -33,7 +33,7 @@ HINT = (
     f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
-"""How to name a vocabulary."""
+"""Advice on naming a vocabulary."""
 MAX_BYTES = 512 * MEGABYTE
 """Largest vocabulary that is read; that of ORB-SLAM3 has 145 MB."""
 MAX_MEMORY = 256 * MEGABYTE

@@ -53,6 +53,7 @@ class Worker:
             raise RuntimeError(
                 "finalize() has stopped ORB-SLAM3's threads: only reset() starts again"
             )
+        # track, and time it
         start = time.perf_counter()
         image = np.ascontiguousarray(rgb)
         if self._monocular:
@@ -60,6 +61,8 @@ class Worker:
         else:
             result = self._slam.track_rgbd(image, np.ascontiguousarray(depth), timestamp)
         seconds = time.perf_counter() - start
+
+        # a pose only after the initialisation; a tracked frame without one is lost
         state = STATES.get(result.state.name, "initialising")
         pose = None
         if result.pose_wc is not None and state != "initialising":

@@ -120,6 +120,7 @@ class ProgramSetting(Record):
         return self
 
     def _check_choices(self) -> None:
+        """Refuse choices beside a range, repeated ones, or a default that is none of them."""
         if self.low is not None or self.high is not None or self.limits is not None:
             raise ValueError("it has choices and a range: leave one out")
         if len(set(map(str, self.choices))) < len(self.choices):
@@ -129,6 +130,7 @@ class ProgramSetting(Record):
             raise ValueError(f"the default {self.default!r} is none of its choices: {shown}")
 
     def _check_range(self, default: float) -> None:
+        """Refuse a range that is no range, or that the default or the limits contradict."""
         if not all(math.isfinite(number) for number in (default, *self._bounds)):
             raise ValueError("its numbers must be finite")
         if (self.low is None) != (self.high is None):
@@ -336,6 +338,17 @@ class BatchProgram(ProgramFile):
         """Refuse a path that may hold the trajectory of another run, or of another program."""
         check_inside(output, "output")
         return output
+
+    @model_validator(mode="after")
+    def _is_written_by_the_program(self) -> "BatchProgram":
+        """Refuse a template that makes the output: it would be scored where the program writes nothing."""
+        for target in self.templates:
+            if os.path.normpath(target) == os.path.normpath(self.output):
+                raise ValueError(
+                    f"output: '{self.output}' is made of the template '{self.templates[target]}' before the program "
+                    "starts: name the file that the program writes"
+                )
+        return self
 
 
 class ServedProgram(ProgramFile):
@@ -592,6 +605,7 @@ def _check_placeholders(
     document: ProgramDocument[Any], places: set[str], *, needs_all: bool
 ) -> None:
     """Refuse placeholders that stand for nothing, and settings that reach no program."""
+    # all texts in which placeholders may stand
     program = document.program
     texts = {"command": " ".join(program.command), "environment": " ".join(program.environment)}
     for target, text in document.templates.items():
@@ -609,6 +623,8 @@ def _check_placeholders(
                 f"{close}; {escape}" if close else escape,
             )
         used |= names
+
+    # a setting that no text names would have no effect
     unused = sorted(settings - used)
     if unused and needs_all:
         names_shown = ", ".join(unused)
@@ -797,6 +813,7 @@ def describe_served(value: str) -> dict[str, Any]:
 
 
 def _described(document: ProgramDocument[Any], base: type[Settings]) -> dict[str, Any]:
+    """Fields of a `TrackerSpec` from a program's file; its presets are checked."""
     program = document.program
     try:
         settings = settings_class(base, document.declared)

@@ -46,16 +46,24 @@ class ReplaySettings(Settings):
         le=1,
         description="largest difference in seconds between a frame's stamp and its pose's",
     )
+    covariances: str = names(
+        "",
+        "file",
+        meaning="file of motion covariances (timestamp and 36 numbers a line); empty for none",
+    )
 
     def verify(self) -> None:
-        """There must be a file, and a trajectory in it."""
+        """There must be a file, and a trajectory in it; and covariances in theirs."""
         from dynslam_bench.geometry import read_tum
+        from dynslam_bench.geometry.motion_covariances import read_motion_covariances
 
         if not self.file.strip():
             raise SettingsError(
                 "replay needs a trajectory file", "write replay:FILE or --set file=FILE"
             )
         read_tum(Path(self.file).expanduser())
+        if self.covariances:
+            read_motion_covariances(self.covariances)
 
 
 class SubprocessSettings(ProgramSettings):

@@ -181,7 +181,7 @@ class Program:
         return code
 
     def ending(self, code: int) -> str:
-        """How it ended, with its last line, in words."""
+        """Words on the program's end, with its last line."""
         shown = "it wrote no message"
         if self._last_line():
             shown = f"its last line: '{self._last_line()}'"
@@ -456,7 +456,7 @@ def _with_space(size: int) -> TemporaryFolder:
 
 
 class Launch(NamedTuple):
-    """How a program is started.
+    """Start of a program.
 
     Attributes:
         command: Program and arguments.
@@ -557,7 +557,7 @@ class ProgramTracker:
             raise
 
     def launch(self, camera: Camera, exchanged: Path) -> Launch:
-        """How the program is started.
+        """Start of the program.
 
         Args:
             camera: The camera of the frames.
@@ -683,7 +683,7 @@ class DescribedProgramTracker(ProgramTracker):
         )
 
     def launch(self, camera: Camera, exchanged: Path) -> Launch:
-        """Its command with the settings' values; the files that it reads are written."""
+        """Command of the program with the settings' values; the files that it reads are written."""
         threads = str(self.context.threads)
         places = {"threads": threads, **camera_values(camera, self.context.fps)}
         filled = self._document.filled(self._settings, places)

@@ -20,7 +20,7 @@ from dynslam_bench.trackers.adapters.subprocess_tracker import ProgramTracker
 STATES = {"DEFAULT_FRAME": "ok", "RELOCALIZING": "lost"}
 """Tracking states by SVO's stages; any other is ``initialising``."""
 _VALUE = object.__basicsize__
-"""Where an object of pybind11 keeps the address of its value: behind Python's own fields."""
+"""Offset at which an object of pybind11 keeps the address of its value: behind Python's own fields."""
 
 
 class Svo(ProgramTracker):

@@ -1,4 +1,4 @@
-"""How a system is composed: one back end for all, and filters of its own; settings and specs that systems share."""
+"""Composition of systems: one back end for all, and filters of their own; settings and specs that systems share."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -234,7 +234,7 @@ BACKEND = (
 )
 """Assumption of every monocular system."""
 CFPN = "the CFPN acts in the embedded network alone: with COCO weights its convolutions are zero (plain Mask R-CNN)"
-"""Where the paper's improved mask branch acts."""
+"""Assumption on where the paper's improved mask branch acts."""
 UNMATCHED: dict[Unmatched, str] = {
     "keep": "a feature that the flow loses is not judged and stays (not stated)",
     "drop": "a feature that the flow loses is dropped",
@@ -336,7 +336,7 @@ def describe_masks(segmentation: SegmentationSettings) -> str:
 
 
 def describe_tracks(flow: "FlowMethodSettings") -> str:
-    """How a system's flow is computed."""
+    """Words on how a system's flow is computed."""
     limit = flow.forward_backward_px
     check = f"a check of {limit:g} px on the way back" if limit else "no check on the way back"
     return f"Lucas-Kanade tracks (window {flow.window_px} px, begun at the motion model's guess, {check})"

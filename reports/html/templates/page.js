@@ -94,7 +94,7 @@ for (const table of select("table.sorts")) { // those of closed folds once they 
 }
 addEventListener("DOMContentLoaded", drawFigures);
 
-// -- paper: folds open, whole tables with all columns, figures without a static picture at the width of a page
+// -- paper: folds open, whole tables with all columns, figures at the width of a page
 const PAPER_PX = 980;
 const whole = []; // what puts tables back as they were
 addEventListener("beforeprint", () => {
@@ -105,7 +105,7 @@ addEventListener("beforeprint", () => {
     if (length > 0) table.page.len(-1).draw(false);
     whole.push(() => { table.columns(hidden).visible(false); if (length > 0) table.page.len(length).draw(false); });
   }
-  for (const element of select(".figure:not(.has-still)")) {
+  for (const element of select(".figure")) {
     if (FIGURES[element.id] && !drawn.has(element)) draw(element, FIGURES[element.id]);
     if (element.layout) Plotly.relayout(element, { width: PAPER_PX, template: THEMES.light });
   }
