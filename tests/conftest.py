@@ -31,10 +31,24 @@ KERNELS = (
     (TRACKER.format("emfoa-oft?masks=none"), TRACKER.format("dynaslam")),
 )
 """What compiles the kernels in two rounds of two processes: rendering and SLAM, flow; then those that use both."""
+LONGEST = (
+    "tests/tuning/test_studies.py",
+    "tests/gate/",
+    "tests/sequences/test_depth_factor.py",
+    "tests/runs/test_runs_many.py",
+    "tests/reports/",
+    "tests/trackers/",
+)
+"""Files that take minutes. With `--no-loadscope-reorder` they begin first, so that all workers end together."""
 
 
 # What is imported and collected lives to the end: searching it for garbage takes a tenth of the time.
 gc.disable()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort files that take minutes to the beginning."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
 def pytest_collection_finish() -> None:
@@ -54,6 +68,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     is_worker = hasattr(session.config, "workerinput")
     if is_worker or not getattr(session.config.option, "numprocesses", None):
         return
+    gc.enable()  # the workers collect the tests, not this process
     # even where everything lies compiled, loading it takes 25 s of processor
     stamp = kernels_stamp()
     if stamp.exists():

@@ -88,11 +88,15 @@ def schemas() -> dict[str, str]:
 
 
 def docstring_pages() -> dict[str, str]:
-    """Markdown of the pages of docstrings, which only the site shows, by their path on it."""
+    """Markdown of the pages of docstrings, which only the site shows, by their path on it.
+
+    The search ranks them behind the guides, whose words they repeat.
+    """
     pages = {}
+    behind = "---\nsearch:\n  boost: 0.01\n---\n\n"
     for name, (title, modules) in PACKAGES.items():
         sections = [f"## {module}\n\n::: dynslam_bench.{module}\n\n" for module in modules]
-        pages[f"reference/python/{name}.md"] = f"# {title}\n\n" + "".join(sections)
+        pages[f"reference/python/{name}.md"] = f"{behind}# {title}\n\n" + "".join(sections)
     return pages
 
 

@@ -217,7 +217,7 @@ def _cell_lines(text: str, width: int) -> list[str]:
 def fields(facts: Mapping[str, object]) -> str:
     """Names and values below each other; empty values are left out.
 
-    On a terminal long values are broken at blanks, but for a command, which people copy.
+    On a terminal long values are broken at blanks, but for a command and a path, which people copy.
     """
     shown = {
         name: cell_text(value)
@@ -228,7 +228,7 @@ def fields(facts: Mapping[str, object]) -> str:
     lines = []
     for name, value in shown.items():
         first = f"{name.ljust(width)}  {value}"
-        is_whole = name == "command" or not sys.stdout.isatty()
+        is_whole = name == "command" or " " not in value or not sys.stdout.isatty()
         lines.append(first if is_whole else wrapped(first, indent=width + 2))
     return "\n".join(lines)
 

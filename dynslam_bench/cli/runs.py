@@ -1,4 +1,7 @@
-"""``runs list|show|rescore|merge|export|rm`` and ``bank add|verify|pull|push``, and runs as the rows of a table."""
+"""``runs list|show|rescore|merge|export|rm``, ``bank add|verify|pull|push|reproduce|check|index``.
+
+Beside these verbs: runs as the rows of a table.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import re
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from itertools import pairwise, product
 from operator import itemgetter
 from pathlib import Path
@@ -17,11 +21,13 @@ from dynslam_bench import runs as stored
 from dynslam_bench.cli.metric_tables import statistics_table
 from dynslam_bench.cli.options import (
     AsJson,
+    DataRoot,
     ProtocolId,
     Results,
     complete_sequences,
     complete_statuses,
     complete_trackers,
+    names_of,
 )
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
@@ -260,6 +266,55 @@ def export(
 
 
 @app.command()
+def archive(
+    server: Annotated[
+        str,
+        typer.Argument(
+            help="eth3d or kitti.",
+            autocompletion=names_of("runs.exchange.server_archives:SERVERS"),
+        ),
+    ],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="The archive, a .zip.")],
+    tracker: Annotated[
+        str, typer.Option(help="Id or label of the tracker.", autocompletion=complete_trackers)
+    ],
+    online: Annotated[
+        bool, typer.Option("--online", help="The causal poses, not the final ones.")
+    ] = False,
+    results: Results = Path("results"),
+    as_json: AsJson = False,
+) -> None:
+    """Write a tracker's runs as an archive for the server of ETH3D or KITTI."""
+    from dynslam_bench.runs.exchange.server_archives import write_server_archive
+
+    which = "online" if online else None
+    written = write_server_archive(server, output, tracker, results=results, which=which)
+    lines = [f"{name}: run {run_id}" for name, run_id in sorted(written.runs.items())]
+    present(written, *lines, str(written.file))
+    for line in written.notes:
+        announce(line)
+
+
+def describe(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of a rendered sequence, a Minari data set or a bank; or a rendered id."
+        ),
+    ],
+    url: Annotated[str, typer.Option(help="Where the data set is published.")] = "",
+    creator: Annotated[str, typer.Option(help="Who publishes it.")] = "dynslam-bench contributors",
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write Croissant metadata and a data card beside a data set."""
+    from dynslam_bench.runs.exchange.dataset_metadata import describe_data
+
+    described = describe_data(source, url=url, creator=creator, data_root=data_root)
+    present(described, f"{described.kind}:", str(described.croissant), str(described.card))
+
+
+@app.command()
 def rm(
     runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,
     results: Results = Path("results"),
@@ -289,12 +344,15 @@ def add(
         ),
     ],
     bank: Folder,
+    protocol: Annotated[
+        str, typer.Option(help="Protocol of a new bank's errors; default tum-rgbd/v1.")
+    ] = "",
     as_json: AsJson = False,
 ) -> None:
     """Add runs without trials of studies; exit with 3 if one is left out, e.g. for another result that is there."""
     from dynslam_bench.runs.bank import add
 
-    show_merged(add(sources, bank), str(bank))
+    show_merged(add(sources, bank, protocol=protocol), str(bank))
 
 
 @banks.command()
@@ -338,6 +396,94 @@ def push(
     from dynslam_bench.runs.bank import push
 
     show_merged(push(bank, target), target)
+
+
+@banks.command()
+def reproduce(
+    bank: Folder,
+    row: Annotated[str, typer.Argument(help="Id of the row, or its first digits.")],
+    by: Annotated[str, typer.Option("--by", help="Your name, as the mark shows it.")],
+    tracker: Annotated[
+        str, typer.Option(help="Where the tracker is here, if its id does not find it.")
+    ] = "",
+    sequence: Annotated[
+        str, typer.Option(help="Folder of the sequence here, if its id does not find it.")
+    ] = "",
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Further starts, run where the result is not equal.")
+    ] = 2,
+    results: Annotated[Path, typer.Option(help="Results folder for the new runs.")] = Path(
+        "results/reproduced"
+    ),
+    data_root: DataRoot = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a row again, and add a mark if it comes out as it did; exit with 4 if it does not."""
+    from dynslam_bench.runs.reproducing import reproduce as run_again
+
+    with progress("reproducing") as advance:
+        done = run_again(
+            bank,
+            row,
+            by=by,
+            tracker=tracker,
+            sequence=sequence,
+            repeats=repeats,
+            results=results,
+            data_root=data_root,
+            on_step=lambda step: advance(0, None, step),
+        )
+    lines = [f"{done.mark.run_id}: {done.describe()}"]
+    if done.mark.changed:
+        lines.append(f"other parts here: {', '.join(done.mark.changed)}")
+    lines.append(f"marked by {by}" if done.reproduced else f"no mark; the new run is {done.folder}")
+    present({"reproduced": done.reproduced, "mark": done.mark}, *lines, verified=done.reproduced)
+
+
+@banks.command()
+def check(
+    submission: Annotated[Path, typer.Argument(help="A bank with the rows that are to be added.")],
+    bank: Annotated[
+        Optional[Path], typer.Option("--bank", help="The bank that is to get them.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say whether a submission is accepted: exit with 0 if it is, with 4 if not, with 1 if it is no bank."""
+    from dynslam_bench.runs.submissions import check_submission
+
+    checked = check_submission(submission, bank)
+    facts = f"{checked.rows} rows, {len(checked.new)} new"
+    verdict = f"accepted: {facts}, errors under {checked.protocol}"
+    if not checked.accepted:
+        verdict = f"refused: {len(checked.faults)} fault{'s' * (len(checked.faults) != 1)}"
+    present(
+        {**asdict(checked), "accepted": checked.accepted},
+        *checked.faults,
+        f"{checked.checker}: {submission} is {verdict}",
+        verified=checked.accepted,
+    )
+
+
+@banks.command()
+def index(bank: Folder, as_json: AsJson = False) -> None:
+    """List the rows of a bank, and write its index page: sequences, trackers, protocol, rows, marks."""
+    from dynslam_bench.runs.bank_index import write_bank_index
+
+    page, rows = write_bank_index(bank)
+    columns = ("row", "tracker", "sequence", "ATE (mm)", "standing", "status", "coverage")
+    cells = [
+        (
+            row.run_id,
+            row.tracker,
+            row.sequence,
+            None if row.ate_m is None else 1000 * row.ate_m,
+            row.standing,
+            row.status,
+            row.coverage,
+        )
+        for row in rows
+    ]
+    present({"page": page, "rows": [asdict(row) for row in rows]}, table(columns, cells), str(page))
 
 
 def show_merged(merged: Merged, target: str) -> None:
@@ -421,9 +567,9 @@ def covariance_words(row: Mapping[str, Any]) -> str:
     """How the covariances of a run's motions fit its errors; empty for a tracker that gives none."""
     parts = []
     for span, over in (("1f", "one frame"), ("1s", "one second")):
-        ratio = row[f"nees_{span}_mean"]
+        ratio = row.get(f"nees_{span}_mean")
         if ratio is not None:
-            within = row[f"within95_{span}"]
+            within = row.get(f"within95_{span}", 0.0)
             parts.append(
                 f"NEES / 6 {ratio:.3g} over {over} ({within:.0%} within the 95 % ellipsoid)"
             )

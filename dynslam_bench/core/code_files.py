@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 
 from dynslam_bench.core.module_graph import parsed
@@ -74,6 +75,10 @@ _STORE = ("index.sqlite", "sequences", "latest")
 """A folder with ``runs/`` and one of these is a results folder."""
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
 """A folder with one of these is a recording."""
+_IMAGES = (".png", ".jpg", ".jpeg", ".pgm", ".tif", ".tiff", ".exr", ".npy")
+"""How the images of recordings end."""
+_MANY_IMAGES = 10
+"""A folder of a recording with so many images holds its frames."""
 
 
 def is_code(file: Path) -> bool:
@@ -119,8 +124,8 @@ def program_files(folder: Path) -> list[Path]:
     These are all code files, and each other file of which the name, or its end with a dot in it, is
     written in one of the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``,
     ``f"{name}_v2.yaml"``. So are all files of a folder whose name a Python source quotes:
-    ``glob("weights/*")``. Hidden folders, virtual environments, results folders and recordings are
-    left out.
+    ``glob("weights/*")``. Hidden folders, virtual environments, results folders and the images of
+    recordings are left out.
 
     Args:
         folder: For example that of a plug-in's file.
@@ -187,8 +192,12 @@ def is_python(file: Path) -> bool:
     return first.startswith(b"#!") and b"python" in first
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """All files below a folder, but for hidden ones, virtual environments, results folders and recordings.
+def files_below(folder: Path, *, in_recording: bool = False) -> Iterator[Path]:
+    """All files below a folder, but for hidden ones, virtual environments, results folders and images of recordings.
+
+    Args:
+        folder: The folder.
+        in_recording: Whether it lies in a recording: then folders of many images are left out.
 
     Raises:
         OSError: The folder cannot be read.
@@ -199,7 +208,17 @@ def files_below(folder: Path) -> Iterator[Path]:
         if entry.is_file():
             yield entry
         elif entry.is_dir() and not _is_left_out(entry) and not leads_back(entry):
-            yield from files_below(entry)
+            # a recording may hold a program's files, too
+            is_recording = in_recording or any((entry / name).exists() for name in _RECORDING)
+            if not (is_recording and _holds_images(entry)):
+                yield from files_below(entry, in_recording=is_recording)
+
+
+def _holds_images(folder: Path) -> bool:
+    """Whether a folder holds as many images as those of a recording do."""
+    with os.scandir(folder) as entries:
+        images = (entry for entry in entries if entry.name.lower().endswith(_IMAGES))
+        return sum(1 for _ in islice(images, _MANY_IMAGES)) == _MANY_IMAGES
 
 
 def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
@@ -402,6 +421,6 @@ def leads_back(entry: Path) -> bool:
 
 
 def _is_left_out(folder: Path) -> bool:
-    """Whether a folder is a virtual environment, a results folder or a recording."""
+    """Whether a folder is a virtual environment or a results folder."""
     is_store = (folder / "runs").is_dir() and any((folder / name).exists() for name in _STORE)
-    return is_store or any((folder / name).exists() for name in ("pyvenv.cfg", *_RECORDING))
+    return is_store or (folder / "pyvenv.cfg").exists()

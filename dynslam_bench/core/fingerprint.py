@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
 _FILE_PREFIXES = ("onnx", "tflite", "weights", "recorded")
 """Segmenters' ids that begin so, with a colon, name a file or folder."""
+_MANY_FILES = 200
+"""A folder with more files holds data: a word that happens to be its name does not name it."""
 
 
 # -- what settings name ----------------------------------------------------------------------------
@@ -59,7 +62,8 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
 
     Args:
         settings: The settings.
-        words: Whether a bare word counts, too, where a file has that name: a plug-in may open it.
+        words: Whether a bare word counts, too, where a file or a folder of at most `_MANY_FILES`
+            files has that name: a plug-in may open it.
 
     Raises:
         PluginError: One cannot be read.
@@ -75,7 +79,8 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
             continue
         for setting, value in _leaves_of(name, attrgetter(name)(settings)):
             text = _path_in(value)
-            if not text and words and os.path.isfile(value):  # noqa: PTH113 - any text
+            is_file = os.path.isfile(value)  # noqa: PTH113 - any text
+            if not text and words and (is_file or _is_small_folder(value)):
                 text = str(value)
             if text:
                 texts.setdefault(setting, text)
@@ -123,6 +128,16 @@ def _path_in(value: str | Path) -> str:
     if is_written_as_file and os.path.isfile(path):  # noqa: PTH113
         return value
     return ""
+
+
+def _is_small_folder(value: str | Path) -> bool:
+    """Whether a text is the name of a folder of few files, which is no results folder."""
+    if not os.path.isdir(value) or not str(value).strip("."):  # noqa: PTH112 - any text
+        return False
+    if os.path.isdir(os.path.join(value, "runs")):  # noqa: PTH112, PTH118
+        return False
+    files = (name for _, _, names in os.walk(value) for name in names)
+    return 0 < sum(1 for _ in islice(files, _MANY_FILES + 1)) <= _MANY_FILES
 
 
 def _leaves_of(name: str, value: object) -> Iterator[tuple[str, str | Path]]:

@@ -18,7 +18,7 @@ def significant_text(value: float, digits: int = 3) -> str:
 
 def mm(metres: float) -> str:
     """Metres as millimetres with three significant digits: 0.0142 is ``14.2``, 2.5 is ``2500``."""
-    if abs(metres) < ROUNDING_M:
+    if 0 < abs(metres) < ROUNDING_M:
         return "0.000"
     return significant_text(1000.0 * metres)
 

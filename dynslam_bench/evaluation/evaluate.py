@@ -137,7 +137,7 @@ def evaluate(
             lost-frame policy ``hold``.
         motion_covariances: What the tracker says of its errors, see `motion_uncertainty`; they are
             scored with poses in metres alone.
-        truth_noise: Of the true poses, for the covariances.
+        truth_noise: Noise of the true poses, for the covariances.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is

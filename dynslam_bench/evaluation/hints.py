@@ -355,7 +355,11 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     accuracy = COPY_M if noise > NOISE_M else EXACT_M
     least = min(accuracy, COPY_SHARE * fits[0].extent_m)
     if error < least:
-        text = f"the error of {mm(error)} mm is below what trackers reach: were the poses read from the truth?"
+        # the scale is fitted: without that the error may be larger
+        text = (
+            f"with the scale fitted, the error of {mm(error)} mm is below what trackers reach: were the poses "
+            "read from the truth?"
+        )
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
 
     # the error jitters less than the truth does: the estimate has the same noise

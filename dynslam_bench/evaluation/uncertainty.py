@@ -110,9 +110,9 @@ def motion_uncertainty(
 
     Args:
         estimate: Camera-to-world poses as they were when their frames came, in metres.
-        covariances: Of the motions to some or all of these frames.
+        covariances: Covariances of the motions to some or all of these frames.
         truth: True camera-to-world poses; those at the frames' stamps are interpolated.
-        noise: Of the true poses.
+        noise: Noise of the true poses.
     """
     # the covariance of each motion between neighbouring poses; NaN where there is none
     matrices = _matrices_of(estimate, covariances)
@@ -121,7 +121,7 @@ def motion_uncertainty(
     if not is_valid.any():
         return Uncertainty(warnings=warnings)
 
-    # motions by estimate and truth, where all is known
+    # motions by estimate and truth, where there are both
     poses, has_truth = _interpolated(truth, estimate.timestamps)
     after = np.arange(1, len(estimate))
     after = after[is_valid & has_truth[1:] & has_truth[:-1]]

@@ -280,13 +280,14 @@ def record(
     cases = gate.cases()
     confirm = gate.cases(confirm=True) if gate.config.confirm else {}
     check_sequences(cases | confirm, gate, 1 if trajectories is not None else rounds)
+    looks, notes = _looks_before(file, gate)
     place = _new_results(results)
 
     # measure development and confirmation set
     if trajectories is None:
         origin = working_tree(gate.folder, (gate.path, file))
         _refuse_uncommitted(origin, uncommitted=uncommitted)
-        notes = _notes_on_untracked(gate, (gate.path, file, Path(results).expanduser()))
+        notes += _notes_on_untracked(gate, (gate.path, file, Path(results).expanduser()))
         notes += _built_here(gate, gate.config.build, origin, file)
         with ExitStack() as stack:
             program = _started(stack, BASELINE, gate.folder, gate, place)
@@ -294,7 +295,6 @@ def record(
             program.side = Side(BASELINE)
             confirmed = _measured(program, confirm, gate, rounds, on_run).all(rounds)
     else:
-        notes = []
         origin = Origin(name=f"the trajectories in {trajectories}")
         store = RunStore(place / BASELINE)
         folder = Path(trajectories)
@@ -319,7 +319,7 @@ def record(
         versions=versions(),
         runs=runs,
         confirmation=confirmed,
-        looks=_looks_before(file, gate),
+        looks=looks,
         notes=notes,
     )
     write_atomic(file, baseline.to_json())
@@ -373,13 +373,26 @@ def _notes_on_untracked(gate: Gate, own: tuple[Path, ...]) -> list[str]:
     ]
 
 
-def _looks_before(file: Path, gate: Gate) -> list[str]:
-    """The looks at the same confirmation set that an older baseline file has counted."""
+def _looks_before(file: Path, gate: Gate) -> tuple[list[str], list[str]]:
+    """The looks at the same confirmation set that an older baseline file has counted, and what to know of them.
+
+    Raises:
+        RunError: A folder lies where the file is to be written.
+    """
+    if file.is_dir():
+        raise RunError(f"{file} is a folder", "name a file with --baseline")
     if not file.is_file():
-        return []
-    older = read_baseline(file)
+        return [], []
+    try:
+        older = read_baseline(file)
+    except RunError as error:
+        # a damaged file is replaced: its error tells to record again
+        lost = (
+            f"looks at the confirmation set in the older file are not counted on: {error.args[0]}"
+        )
+        return [], [lost]
     is_same = older.asked.confirm == gate.config.confirm
-    return older.looks if is_same else []
+    return (older.looks if is_same else []), []
 
 
 # -- check ---------------------------------------------------------------------------------------------
@@ -791,10 +804,12 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
         )
     if all(case.baseline_m is None for case in result.cases):
         return f"all runs of the baseline were lost or failed on {on}, so nothing can be compared"
-    broken = "".join(f"guardrail broken: {guardrail.text}; " for guardrail in result.broken)
+    overruling = "".join(
+        f"guardrail {guardrail.state}: {guardrail.text}; " for guardrail in result.overruling
+    )
     more_lost = f"; lost runs {lost_baseline} -> {lost}" if lost != lost_baseline else ""
     if result.ratio is None:
-        return f"{broken}nothing could be compared on {on}{more_lost}"
+        return f"{overruling}nothing could be compared on {on}{more_lost}"
     percent = 100.0 * (result.ratio - 1.0)
     measured = f"{abs(percent):.1f} % {'more' if percent > 0 else 'less'} error on {on}"
     words = {
@@ -804,7 +819,7 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
         GateVerdict.NO_DIFFERENCE: f"{measured}; differences above {100 * result.margin:g} % are excluded",
         GateVerdict.UNDECIDED: f"{measured} so far, within the scatter",
     }
-    return broken + words[by_error] + more_lost
+    return overruling + words[by_error] + more_lost
 
 
 def _written(result: GateResult, place: Path) -> GateResult:

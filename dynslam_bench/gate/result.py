@@ -127,9 +127,11 @@ class GateResult(Record):
         return self.exit_code == PASSED
 
     @property
-    def broken(self) -> list[GuardrailResult]:
-        """The guardrails that are broken."""
-        return [guardrail for guardrail in self.guardrails if guardrail.state == "broken"]
+    def overruling(self) -> list[GuardrailResult]:
+        """The guardrails that keep the gate from passing: broken ones, else those that cannot be judged."""
+        states = {REGRESSED: ("broken",), UNDECIDED: ("open", "not measured")}
+        kept = states.get(self.exit_code, ())
+        return [guardrail for guardrail in self.guardrails if guardrail.state in kept]
 
     @property
     def worst(self) -> CaseResult | None:

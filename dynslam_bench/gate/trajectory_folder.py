@@ -82,13 +82,13 @@ def _files_of(folder: Path, case: str) -> list[Path]:
     several = folder / name
     if several.is_dir():
         return _visible_files(several.iterdir())
-    found = _visible_files(folder.glob(f"{name}.*"))
-    if len(found) > 1:
+    files = _visible_files(folder.glob(f"{name}.*"))
+    if len(files) > 1:
         raise RunError(
-            f"{folder} has {len(found)} files for {case}: {', '.join(file.name for file in found)}",
+            f"{folder} has {len(files)} files for {case}: {', '.join(file.name for file in files)}",
             f"keep one, or put the files of several runs into the folder {name}",
         )
-    return found
+    return files
 
 
 def _visible_files(paths: Iterable[Path]) -> list[Path]:

@@ -1,7 +1,8 @@
 """A bank of trajectories: a results folder of text files alone, with checksums, that is exchanged and scored again.
 
 It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/<part>/`` with
-stamps and ground truth, and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever
+stamps and ground truth, ``bank.json`` with its protocol, ``marks/`` of those who have run a row
+again (`bank_files`), and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever
 reads a results folder reads a bank.
 
 Runs are added in four steps: an empty file `UNFINISHED` is written, the runs are copied, each of
@@ -14,7 +15,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 from pydantic import ConfigDict, Field
@@ -37,18 +38,38 @@ from dynslam_bench.core import (
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.records import Record, digest, validated
+from dynslam_bench.evaluation import get_protocol
+from dynslam_bench.runs.bank_files import (
+    DESCRIPTION_FILE,
+    MARKS_FOLDER,
+    BankDescription,
+    Mark,
+    mark_file,
+    new_description,
+    read_description,
+    read_marks,
+)
 from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
-from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, TrajectoryKind, Unreadable
+from dynslam_bench.runs.layout import (
+    COVARIANCES,
+    FINAL,
+    ONLINE,
+    RUN_FILE,
+    STAMPS,
+    TrajectoryKind,
+    Unreadable,
+)
 from dynslam_bench.runs.record import RunRecord, run_id_of
-from dynslam_bench.runs.store import Merged, RunStore, open_store
+from dynslam_bench.runs.store import DEFAULT_PROTOCOL, Merged, RunStore, open_store
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
+from dynslam_bench.sequences.synthetic.ids import probe_id
 
 SUMS = "SHA256SUMS"
 """The list of checksums, in the format of ``sha256sum -c``."""
 UNFINISHED = ".unfinished"
 """An empty file that is there while runs are added."""
-_CONTENT_FOLDERS = ("runs", "sequences")
+_CONTENT_FOLDERS = ("runs", "sequences", MARKS_FOLDER)
 """Folders whose files are listed with their checksums."""
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
 """The address of an archive, which is downloaded."""
@@ -60,7 +81,7 @@ class Bank(RunStore):
     """A results folder that takes of a run what scores are computed from, and nothing of the machine that made it."""
 
     def copy_from(self, other: RunStore, record: RunRecord) -> RunRecord:
-        """Copy the record, the trajectories, the stamps and the ground truth of a run.
+        """Copy the record, trajectories and covariances of a run, and the stamps and ground truth of its sequence.
 
         Raises:
             InfrastructureError: It cannot be written.
@@ -71,7 +92,7 @@ class Bank(RunStore):
         with self.work_folder(record.run_id) as work:
             # the run's own files, read while nobody changes them
             with self.copying(other, record):
-                for name in (ONLINE, FINAL):
+                for name in (ONLINE, FINAL, COVARIANCES):
                     file = other.folder(record.run_id) / name
                     if file.is_file():
                         shutil.copyfile(file, work / name)
@@ -100,6 +121,8 @@ class Bank(RunStore):
                 is_unfinished = any(is_temporary(Path(name)) for name in inside.parts)
                 if not is_unfinished and (path.is_symlink() or path.is_file()):
                     names.append(inside.as_posix())
+        if (self.root / DESCRIPTION_FILE).exists():
+            names.append(DESCRIPTION_FILE)
         return sorted(names)
 
 
@@ -139,18 +162,20 @@ class Manifest(Record):
     trajectory: list[StatedTrajectory]
 
 
-def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
+def add(sources: Iterable[str | Path], bank: str | Path, *, protocol: str = "") -> Merged:
     """Add the runs of results folders and the trajectories of manifests to a bank; trials of studies are no results.
 
     Args:
         sources: Results folders, archives of such, and manifests (``.toml``).
         bank: The bank; it is made where there is none.
+        protocol: Protocol under which its rows are compared; for a new bank the default one.
 
     Returns:
         What was added, what was there already, and what was left out, with reasons (see `merge`).
 
     Raises:
-        RunError: A source holds no runs or is no manifest, or the bank has faults.
+        RunError: A source holds no runs or is no manifest, or the bank has faults or another
+            protocol.
         DynslamError: The bank cannot be written.
     """
     with ExitStack() as stack:
@@ -164,7 +189,7 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
                 stores.append(store)
             else:
                 stores.append(open_store(source))
-        merged = _merge(stores, bank)
+        merged = _merge(stores, bank, protocol)
     return Merged(merged.added, merged.stored, left_out + merged.left_out)
 
 
@@ -179,6 +204,7 @@ def read_manifest(path: Path) -> list[StatedTrajectory]:
 
 def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
     """Import what a manifest names; yields what cannot be, with reasons."""
+    taken: dict[str, str] = {}
     with closing(TemporaryFolder()) as folder:
         for entry in read_manifest(manifest):
             try:
@@ -187,7 +213,7 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
                 truth = None
                 if entry.truth:
                     truth = _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path)
-                import_trajectory(
+                record = import_trajectory(
                     file,
                     entry.tracker,
                     entry.sequence,
@@ -197,6 +223,11 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
                     provenance=entry.provenance or entry.file,
                     truth=truth,
                 )
+                # a second table of the same id would replace the first one
+                if record.run_id in taken:
+                    same = f"the same trajectory of {entry.tracker} as {taken[record.run_id]}"
+                    raise RunError(f"it has the id {record.run_id}, {same}")
+                taken[record.run_id] = entry.file
             except InfrastructureError:
                 raise
             except DynslamError as error:
@@ -274,12 +305,47 @@ def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
     faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
 
     # records that are damaged or do not fit
+    faults += _doubled_rows(store)
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
     for record in records:
         faults += [
             f"runs/{record.run_id}: {fault}" for fault in _faults_of_run(store, record, listed)
         ]
+    return faults + _faults_of_marks(store)
+
+
+def _doubled_rows(store: Bank) -> list[str]:
+    """Rows that have the id of another one, a line each."""
+    folders: dict[str, list[str]] = {}
+    for file in sorted(store.runs.glob(f"*/{RUN_FILE}")):
+        with suppress(DynslamError):  # damaged records are named elsewhere
+            run_id = RunRecord.read(file).run_id
+            folders.setdefault(run_id, []).append(f"runs/{file.parent.name}")
+    return [
+        f"{len(names)} rows have the id {run_id}: {', '.join(names)}"
+        for run_id, names in folders.items()
+        if len(names) > 1
+    ]
+
+
+def _faults_of_marks(store: Bank) -> list[str]:
+    """Faults of a bank's description and marks, one line each."""
+    try:
+        description = read_description(store.root)
+        known = get_protocol(description.protocol).digest()
+    except DynslamError as error:
+        return [str(error)]
+    faults = []
+    if description.protocol_digest not in ("", known):
+        stated = description.protocol_digest
+        faults.append(f"its protocol {description.protocol} has the digest {stated}, here {known}")
+    marks, unreadable = read_marks(store.root)
+    faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
+    rows = set(store.ids())
+    for mark in (mark for of_row in marks.values() for mark in of_row):
+        if fault := mark.fault(description, rows):
+            faults.append(f"{MARKS_FOLDER}/{mark.run_id}/{mark.by}.json: {fault}")
     return faults
 
 
@@ -361,7 +427,7 @@ def pull(source: str, bank: str | Path) -> Merged:
         store.source = Path(source) if Path(source).exists() else Path(Path(source).name)
         if not (store.root / SUMS).is_file():
             raise RunError(f"{source} is no bank: it has no {SUMS}")
-        _check(store.root)
+        check_sound(store.root)
         return _merge([store], bank)
 
 
@@ -376,7 +442,7 @@ def push(bank: str | Path, target: str) -> Merged:
         RunError: One of the two has faults, or git refuses, e.g. since another push came first.
         DynslamError: The target cannot be written.
     """
-    _check(bank)
+    check_sound(bank)
     if not _is_repository(target):
         return _merge([RunStore(bank)], target)
     with _cloned(target) as clone:
@@ -393,15 +459,120 @@ def push(bank: str | Path, target: str) -> Merged:
             )
         # add to the clone, then commit and push it
         merged = _merge([RunStore(bank)], clone)
-        if merged.added:
-            _git(clone, "add", "--force", "--", SUMS, *_CONTENT_FOLDERS)
-            _git(clone, "commit", "--quiet", "--message", f"Add runs: {len(merged.added)}")
-            _git(clone, "push", "--quiet", "origin", "HEAD")
+        _commit(clone, f"Add runs: {len(merged.added)}" if merged.added else "Add marks")
     return merged
 
 
-def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
-    """Merge stores into a bank without faults, and bring its checksums up to date; one process at a time.
+def _commit(clone: Path, message: str) -> None:
+    """Commit what is new in a clone of a bank, if anything, and push it.
+
+    Raises:
+        RunError: git refuses.
+    """
+    parts = (SUMS, DESCRIPTION_FILE, *_CONTENT_FOLDERS)
+    present = [name for name in parts if (clone / name).exists()]
+    _git(clone, "add", "--force", "--", *present)
+    if not _git(clone, "diff", "--cached", "--name-only"):
+        return
+    _git(clone, "commit", "--quiet", "--message", message)
+    _git(clone, "push", "--quiet", "origin", "HEAD")
+
+
+def add_mark(bank: str | Path, mark: Mark) -> None:
+    """Add a mark to a bank, in place of an earlier one by the same name.
+
+    Raises:
+        RunError: The bank has faults, or the mark does not fit it.
+        InfrastructureError: It cannot be written.
+    """
+    with _changing(bank) as store:
+        if fault := mark.fault(read_description(store.root), store.ids()):
+            raise RunError(f"no mark: {fault}")
+        write_atomic(mark_file(store.root, mark.run_id, mark.by), mark.to_json())
+
+
+def _merge(sources: Sequence[RunStore], bank: str | Path, protocol: str = "") -> Merged:
+    """Merge stores into a bank: the runs, the marks, and what holds for the bank.
+
+    Args:
+        sources: Results folders and banks.
+        bank: The bank.
+        protocol: Its protocol; empty for that of a source that is a bank, or the default one.
+    """
+    with _changing(bank) as store:
+        description = _joined_description(sources, store, protocol)
+        merged = merge(sources, store, trials=False)
+        for source in sources:
+            merged.left_out.extend(_copy_marks(source, store))
+        probes = _probes_of(sources, description)
+        whole = description.model_copy(update={"probes": probes})
+        write_atomic(store.root / DESCRIPTION_FILE, whole.to_json())
+    return merged
+
+
+def _joined_description(sources: Sequence[RunStore], store: Bank, protocol: str) -> BankDescription:
+    """The description of a bank after those of the sources that are banks.
+
+    Raises:
+        RunError: They do not fit each other, or the bank has another protocol.
+    """
+    described = [source for source in sources if (source.root / DESCRIPTION_FILE).is_file()]
+    is_new = not store.ids() and not (store.root / DESCRIPTION_FILE).is_file()
+    if not is_new:
+        joined = read_description(store.root)
+    elif protocol or not described:
+        joined = new_description(protocol or DEFAULT_PROTOCOL)
+    else:
+        joined = read_description(described[0].root)
+    if protocol and joined.protocol != protocol:
+        raise RunError(
+            f"{store.root} is a bank under {joined.protocol}, not {protocol}",
+            "name another bank, or leave --protocol out",
+        )
+    for source in described:
+        other = read_description(source.root)
+        if difference := joined.difference(other):
+            raise RunError(f"{source.source} and {store.root} do not fit: {difference}")
+        joined = joined.model_copy(update={"probes": other.probes | joined.probes})
+    return joined
+
+
+def _probes_of(sources: Sequence[RunStore], description: BankDescription) -> dict[str, str]:
+    """The digests of a bank's rendered families; those that results folders bring are rendered here."""
+    probes = dict(description.probes)
+    for source in sources:
+        if (source.root / SUMS).is_file():  # a bank has its own
+            continue
+        for record in source.all()[0]:
+            if record.kind != "run" or not record.sequence.id.startswith("synthetic/"):
+                continue
+            probe = probe_id(parse_synthetic_id(record.sequence.id).name)
+            if probe not in probes:
+                from dynslam_bench.sequences.synthetic.digests import probe_digest
+
+                probes[probe] = probe_digest(probe)
+    return probes
+
+
+def _copy_marks(source: RunStore, store: Bank) -> Iterator[Unreadable]:
+    """Copy the marks of rows that a bank has, the newer of two by one name; yields those that do not fit."""
+    marks, unreadable = read_marks(source.root)
+    yield from unreadable
+    here, _ = read_marks(store.root)
+    description = read_description(source.root)
+    rows = set(store.ids())
+    for run_id, of_row in marks.items():
+        known = {mark.by: mark.made for mark in here.get(run_id, ())}
+        for mark in of_row:
+            if fault := mark.fault(description, rows):
+                yield Unreadable(mark_file(source.root, run_id, mark.by), fault)
+            elif mark.made > known.get(mark.by, ""):
+                write_atomic(mark_file(store.root, run_id, mark.by), mark.to_json())
+
+
+@contextmanager
+def _changing(bank: str | Path) -> Iterator[Bank]:
+    """A bank without faults while it is changed, by one process at a time; its checksums are right afterwards.
 
     It goes on where a process was killed that did the same.
     """
@@ -414,11 +585,11 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
         if unfinished.exists():
             _refuse(store.root, _faults(store, unfinished=True))
         elif (store.root / SUMS).exists() or store.files():
-            _check(store.root)
+            check_sound(store.root)
         # a mark that stands until the checksums are right again
         write_atomic(unfinished, "")
         try:
-            return merge(sources, store, trials=False)
+            yield store
         finally:  # what was copied before a fault is whole
             _write_sums(store)
             with translate_errors(
@@ -442,7 +613,7 @@ def _write_sums(store: Bank) -> None:
     write_atomic(store.root / SUMS, "".join(lines))
 
 
-def _check(bank: str | Path) -> None:
+def check_sound(bank: str | Path) -> None:
     """Refuse a bank that has faults.
 
     Raises:
@@ -484,8 +655,8 @@ def _cloned(repository: str) -> Iterator[Path]:
         yield clone
 
 
-def _git(folder: Path, verb: str, *words: str) -> None:
-    """Run git in a folder.
+def _git(folder: Path, verb: str, *words: str) -> str:
+    """Run git in a folder; returns what it writes.
 
     Raises:
         RunError: It is not installed, or refuses.
@@ -503,3 +674,4 @@ def _git(folder: Path, verb: str, *words: str) -> None:
         raise RunError(
             f"git {verb} ended with exit code {done.returncode}: {' '.join(done.stderr.split())[-400:]}"
         )
+    return done.stdout

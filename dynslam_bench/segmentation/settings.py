@@ -328,7 +328,7 @@ class SegmentationSettings(Settings):
         meaning="networks of probability maps (selfie, tflite): probability above which a pixel is masked",
     )
     map_decay: float = tunable(
-        0.5,
+        0.3,
         low=0.0,
         high=0.9,
         limits=(0.0, 1.0),

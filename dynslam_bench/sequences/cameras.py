@@ -487,6 +487,8 @@ _MOST_FOLDED = 0.05
 """Share of the pixels that a distortion may send to a wrong place: calibrations are often poor in the corners."""
 _FOLDED_PX = 1.0
 """A pixel that comes back farther than this from its place was sent to a wrong one."""
+_LEAST_DRAWN = 0.5
+"""Least share of its distance from the centre at which an undistorted corner lies; 0.9 of lenses with a pincushion."""
 
 
 def check_camera(camera: Camera, where: str) -> None:
@@ -550,6 +552,12 @@ def _faults(camera: Camera) -> Iterator[str]:
             f"the distortion {list(camera.distortion)} folds the image: {100 * folded:.0f} % of its pixels do not come "
             "back when they are undistorted and distorted again"
         )
+    drawn = _corner_drawn_to(camera)
+    if drawn < _LEAST_DRAWN:
+        yield (
+            f"the distortion {list(camera.distortion)} draws a corner of the image to {drawn:.2g} of its distance from "
+            f"the centre, expected {_LEAST_DRAWN:g} or more"
+        )
 
 
 def _is_rotation(rows: tuple[tuple[float, float, float], ...]) -> bool:
@@ -559,6 +567,20 @@ def _is_rotation(rows: tuple[tuple[float, float, float], ...]) -> bool:
         return False
     rotation = nearest_rotation(matrix)
     return bool(np.abs(rotation - matrix).max() < 0.01 and np.linalg.det(rotation) > 0)
+
+
+def _corner_drawn_to(camera: Camera) -> float:
+    """Distance from the centre of the farthest corner when it is undistorted, as a share of that before."""
+    right = camera.width - 1
+    bottom = camera.height - 1
+    corners = np.array([[0, 0], [right, 0], [0, bottom], [right, bottom]], dtype=np.float64)
+    centre = np.array([camera.cx, camera.cy])
+    focal_lengths = np.array([camera.fx, camera.fy])
+    distances = np.linalg.norm((corners - centre) / focal_lengths, axis=1)
+    farthest = int(distances.argmax())
+    undistorted = camera.undistort_points(corners[farthest : farthest + 1])
+    drawn = np.linalg.norm((undistorted[0] - centre) / focal_lengths)
+    return float(drawn / distances[farthest])
 
 
 def _folded_share(camera: Camera) -> float:

@@ -140,6 +140,11 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "take the truth of this recording",
     ),
     "truth-far": ("", "{text}", "correct that line of groundtruth.txt, or remove it"),
+    "truth-far/all": (
+        "",
+        "{text}, and the images tell no other motion",
+        "give the positions of groundtruth.txt in metres",
+    ),
     "truth-sparse": (
         "frames",
         "{value:.0f} of {frames} frames have a true pose within {within} s",

@@ -106,12 +106,22 @@ def truth_findings(
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
         return [finding_of("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
 
-    # a pose that no camera reaches; a wrong unit of all of them shows in the comparison
+    # a pose that no camera reaches
     motion = impossible_motion(truth, "ground truth")
     if motion is not None and motion.of_single_poses:
         return [finding_of("truth-far", None, text=motion.fault)]
 
-    # do the images show a motion?
+    # a wrong unit of all poses shows in the comparison with the images, if one can be made
+    findings = _findings_by_images(stamps, truth, camera, pairs)
+    if motion is not None and all(finding.severity == "note" for finding in findings):
+        findings.insert(0, finding_of("truth-far/all", None, text=motion.fault))
+    return findings
+
+
+def _findings_by_images(
+    stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair]
+) -> list[Finding]:
+    """What the truth of a recording does not share with the motion that its images show; see `truth_findings`."""
     usable = [
         pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5
     ]

@@ -19,6 +19,7 @@ from queue import SimpleQueue
 from typing import Any, BinaryIO, TypeVar
 
 from dynslam_bench.core import InfrastructureError
+from dynslam_bench.runs.process.jobs import THREAD_VARIABLES
 
 T = TypeVar("T")
 Call = tuple[Callable[..., Any], Sequence[tuple[Any, ...]]]
@@ -87,7 +88,11 @@ class WorkerPool:
 def _start_worker() -> "subprocess.Popen[bytes]":
     """Start a worker that imports modules from where the caller does."""
     command = [sys.executable, "-c", _PROGRAM, *sys.path]
-    worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    # a worker a core: the numerical libraries get no threads of their own
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, "1")
+    worker = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+    )
     with suppress(BrokenPipeError):  # it has died; the first call tells
         _send(worker.stdin, serve)
     return worker

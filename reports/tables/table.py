@@ -268,6 +268,8 @@ _LATEX = {
         "~": r"\textasciitilde{}",
         "^": r"\textasciicircum{}",
         "|": r"\textbar{}",
+        # behind a line's end a bracket would be its optional argument, and LaTeX go on for ever
+        "[": "{[}",
     },
     **{
         "<": r"\textless{}",
@@ -325,11 +327,15 @@ def to_latex(table: Table, protocol: str = "") -> str:
     )
 
 
+_BREAKS = re.compile(r"([./?=]|\\_|\\&)(?=[A-Za-z0-9])")
+"""Where a long name may be broken, such as a setting's."""
+
+
 def escape_latex(text: str) -> str:
     """Text with LaTeX's special characters escaped, on one line.
 
     Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs
-    for, are named by their code point: ``[U+1F600]``.
+    for, are named by their code point, U+1F600 in brackets.
     """
     return "".join(_character(character) for character in " ".join(text.split()))
 
@@ -343,7 +349,7 @@ def _character(character: str) -> str:
     # a letter without its accent, where pdflatex has no glyph
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
     if not plain:
-        return f"[U+{ord(character):04X}]"
+        return f"{{[}}U+{ord(character):04X}]"
     return "".join(_LATEX.get(letter, letter) for letter in plain)
 
 
@@ -448,7 +454,9 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
             if position in table.separators and body:
                 body.append("\\midrule")
             name, *others = (_latex_cell(row[at]) for at in columns)
-            body.append(" & ".join([f"\\raggedright {name}" if wide else name, *others]) + " \\\\")
+            if wide:
+                name = "\\raggedright " + _BREAKS.sub(r"\1\\allowbreak{}", name)
+            body.append(" & ".join([name, *others]) + " \\\\")
         height = head_lines + sum(lines[first : first + fitting])
         begin = [f"\\begin{{tabular}}{{@{{}}{alignment}@{{}}}}", "\\toprule", *head, "\\midrule"]
         parts.append(("\n".join([*begin, *body, "\\bottomrule", "\\end{tabular}"]), height))

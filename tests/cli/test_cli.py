@@ -189,8 +189,6 @@ def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli
     findings = found["findings"]
     assert "truth-inverted" in {finding["id"] for finding in findings}
     assert found["verdict"] == "1 fault: not ready"
-    code, out, _ = cli("sequences", "doctor", faulty)
-    assert (code, out.splitlines()[-1]) == (4, f"{faulty}: 34 frames compared, 1 fault: not ready")
     code, out, _ = cli("sequences", "doctor", sound)
     assert code == 0
     assert out.endswith(": ready\n")

@@ -150,7 +150,8 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
     code, _, err = cli(*command)
     assert code == 1
-    assert "170 MB" in err
+    assert "0.25 MB" in err
+    assert "Apache-2.0" in err
     assert not fetched.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
     assert cli(*command)[0] == 0

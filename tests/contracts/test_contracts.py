@@ -118,11 +118,28 @@ def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
         (given(timings={"t": float("nan")}), "timings with values"),
         (given(timings={"t": -1.0}), "a timing that is negative"),
         (given(dynamic_mask=np.zeros((4, 6), np.uint8)), "a dynamic mask of type uint8"),
+        (given(motion_covariance=np.eye(3)), "a motion covariance of shape (3, 3)"),
+        (given(motion_covariance="sure"), "a motion covariance of shape ()"),
+        (given(motion_covariance=np.full((6, 6), np.nan)), "a motion covariance of shape (6, 6)"),
+        (given(motion_covariance=np.zeros((6, 6))), "a motion covariance with the eigenvalue 0"),
+        (given(motion_covariance=np.triu(np.ones((6, 6)))), "a motion covariance that is not sym"),
     ],
 )
 def test_blemishes_are_no_faults(result: TrackResult, words: str) -> None:
     assert not list(faults(result, FRAME))
     assert [fault.found[: len(words)] for fault in blemishes(result)] == [words]
+
+
+def test_a_covariance_is_taken_in_float64_and_none_costs_a_run() -> None:
+    taken = check_result(given(motion_covariance=np.eye(6, dtype=np.float32)), FRAME, "mine")
+    assert taken.motion_covariance is not None
+    assert taken.motion_covariance.dtype == np.float64
+    assert (taken.motion_covariance == np.eye(6)).all()
+    for wrong in (np.eye(3), "sure", [[1, 2], [3]], {"a": 1}):
+        taken = check_result(given(motion_covariance=wrong), FRAME, "mine")
+        assert taken.motion_covariance is not None
+        assert np.isnan(taken.motion_covariance).all()
+    assert check_result(given(), FRAME, "mine").motion_covariance is None
 
 
 @pytest.mark.parametrize("state", STATES)

@@ -258,6 +258,17 @@ def test_only_what_names_a_file_counts_as_one(
     write(tmp_path / "fast", "a plug-in may open it")
     assert named_digests(Whole(word="fast")) == {}
     assert set(named_digests(Whole(word="fast"), words=True)) == {"inner.source", "word"}
+    write(tmp_path / "fast,nets" / "small" / "net.onnx", "one")
+    assert named_digests(Whole(word="fast,nets")) == {}
+    of_folder = named_digests(Whole(word="fast,nets"), words=True)
+    assert set(of_folder) == {"inner.source", "word"}
+    write(tmp_path / "fast,nets" / "small" / "net.onnx", "two")
+    assert named_digests(Whole(word="fast,nets"), words=True)["word"] != of_folder["word"]
+    for index in range(200):
+        write(tmp_path / "fast,nets" / f"{index}.png", "1111")
+    assert set(named_digests(Whole(word="fast,nets"), words=True)) == {"inner.source"}, "data"
+    for word in (".", "..", "\0", ""):
+        assert set(named_digests(Whole(word=word), words=True)) == {"inner.source"}
     net = write(tmp_path / "net.onnx", "one")
     write(tmp_path / "voc.txt", "words")
     masks = write(tmp_path / "elsewhere" / "000000.png", "1111")

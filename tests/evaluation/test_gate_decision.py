@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 from helpers.sequence_folders import SHARED
+from scipy import stats
 
 from dynslam_bench.evaluation.gate import (
     CLIP,
     LOOKS,
+    ONE_LOOK,
     GateVerdict,
     decide,
     is_lost_more,
@@ -114,3 +116,17 @@ def test_no_claim_is_bolder_than_the_prototype_s() -> None:
         assert after in (names.get(before, before), "undecided")
         same += after == names.get(before, before)
     assert same >= 270
+
+
+def test_the_looks_spend_four_percent_by_the_square_of_the_share_of_rounds() -> None:
+    paths = 400_000
+    rng = np.random.default_rng(0)
+    sums = rng.normal(size=(paths, max(LOOKS))).cumsum(axis=1)
+    is_inside = np.ones(paths, dtype=bool)
+    for rounds, level in LOOKS.items():
+        score = np.abs(sums[:, rounds - 1]) / math.sqrt(rounds)
+        is_inside &= score <= stats.norm.isf(level / 2.0)
+        spent = 1.0 - is_inside.mean()
+        share = ONE_LOOK * (rounds / max(LOOKS)) ** 2
+        # three standard errors of the simulation, and levels of four digits
+        assert spent == pytest.approx(share, abs=3.0 * math.sqrt(share / paths) + 1e-4)

@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 from helpers.published_folders import WRITERS, random_poses
+from helpers.tflite_files import tflite
 
 from dynslam_bench.cli.output import cell_text  # how a cell of a table is written
 from dynslam_bench.contracts import Frame, MapOutputs
@@ -37,13 +38,14 @@ from dynslam_bench.core import (
 from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.geometry import Camera, load_tum, read_kitti
+from dynslam_bench.geometry.motion_covariances import read_motion_covariances
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, packing
 from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.layout import INDEX_FILE
 from dynslam_bench.runs.listing import list_runs
 from dynslam_bench.segmentation import recorded
-from dynslam_bench.segmentation.networks import onnx_header, onnx_layout
+from dynslam_bench.segmentation.networks import onnx_header, onnx_layout, tflite_header
 from dynslam_bench.segmentation.training import labelled_images
 from dynslam_bench.sequences import cameras, catalogue, fetch
 from dynslam_bench.sequences.readers import files, layouts
@@ -990,6 +992,20 @@ BINARIES = [
         _load_network,
         _checkpoints,
         mutate_zip,
+    ),
+    Target(
+        "TensorFlow Lite header",
+        lambda data, folder: str(tflite_header.read_tflite_header(at(folder, "net.tflite", data))),
+        lambda: [tflite(), tflite(labels=()), tflite(outputs=((1, 10), (1, 2, 3)), labels=())],
+    ),
+    Target(
+        "motion covariances",
+        lambda data, folder: read_motion_covariances(at(folder, "covariances.txt", data)),
+        lambda: [
+            b"# heading\n1.5 " + b"0.1 " * 36 + b"\n2.5 " + b"nan " * 36 + b"\n",
+            b"inf " + b"1e400 " * 36,
+            b"1.5 2\n",
+        ],
     ),
     Target(
         "ONNX header",

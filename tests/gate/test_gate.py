@@ -350,9 +350,9 @@ def fresh_children(monkeypatch):
 
 @pytest.fixture(scope="module")
 def sequences(tmp_path_factory):
-    """Two short recordings of the toy world."""
+    """Two recordings of the toy world, as short as the starts of ten rounds allow."""
     root = tmp_path_factory.mktemp("sequences")
-    return [write_folder(root / "one", 10), write_folder(root / "two", 12)]
+    return [write_folder(root / "one", 11), write_folder(root / "two", 12)]
 
 
 @pytest.fixture
@@ -716,6 +716,12 @@ def test_a_damaged_baseline_is_refused_in_one_line(tmp_path, sequences, damage, 
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert caught.value.hint
+
+    # the cure works
+    made = gates.record(question, trajectories=files, results=tmp_path / "results")
+    assert words in made.notes[0]
+    again = gates.check(question, trajectories=files, results=tmp_path / "results")
+    assert again.verdict is GateVerdict.IDENTICAL
 
 
 def test_the_json_fits_its_schema_and_nothing_else_does(tmp_path, sequences) -> None:

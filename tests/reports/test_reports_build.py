@@ -813,6 +813,27 @@ def test_captions_are_short_and_name_no_ids(odd):
     assert r"$^*$\,our back end" in text
 
 
+def test_a_bracket_never_follows_the_end_of_a_line_of_latex(tmp_path):
+    """It would be an optional argument there: on parts of sequences LaTeX went on for ever."""
+    columns = [Column("tracker", numeric=False), Column("walking_xyz? scene=102 [0:60]")]
+    long = "Mask R-CNN culling · segmentation.source=oracle, segmentation.dilation_px=12"
+    rows = [[TableCell(name), TableCell("6.50")] for name in (long, "[mine]", "[other]")]
+    text = to_latex(Table("t", "T", "long", columns, rows), "p")
+    assert "0:60" in text
+    assert "mine" in text
+    assert not re.search(r"\\\\\s*\[", text)
+    if shutil.which("pdflatex") is None:
+        return
+    (tmp_path / "paper.tex").write_text(
+        r"\documentclass[twocolumn]{article}\usepackage{booktabs}\begin{document}"
+        + text
+        + r"\end{document}"
+    )
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, check=True, timeout=60)
+    assert "Overfull" not in (tmp_path / "paper.log").read_text(errors="replace")
+
+
 def test_latex_stands_in_blocks_and_floats():
     names = [
         Column("tracker", numeric=False),
@@ -830,7 +851,7 @@ def test_latex_stands_in_blocks_and_floats():
 
 def test_no_name_is_more_than_a_name():
     assert escape_latex("a\nb\x00c") == "a b c"
-    assert escape_latex("😀 é 猫 “q”") == "[U+1F600] é [U+732B] ``q''"
+    assert escape_latex("😀 é 猫 “q”") == "{[}U+1F600] é {[}U+732B] ``q''"
     cells = [
         [TableCell("=HYPERLINK(1)"), TableCell("-1.5", value=-1.5)], [TableCell("@x"), TableCell("+2")],
         [TableCell("\x1b[2J\u202e"), TableCell()],

@@ -312,6 +312,17 @@ def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench
     assert bench.changed(reads) == "the file mask.png"
 
 
+@pytest.mark.parametrize("beside", ["associations.txt", "rgb.txt", "runs/x.json"])
+@pytest.mark.parametrize("named", ["'net.onnx'", "'nets/net.onnx'", "f'{name}.onnx'"])
+def test_a_network_beside_a_list_of_images(named: str, beside: str, bench: Bench) -> None:
+    """The folder looks like a recording or like results; it is opened in machine code."""
+    bench.write("plugin/nets/net.onnx", "1111")
+    bench.write(f"plugin/nets/{beside}", "1111")
+    reads = bench.record(f"def run(name):\n    return {named}\n", name="net")
+    edit(bench.plugin.parent / "nets/net.onnx", "2222")
+    assert bench.changed(reads) == "the file nets/net.onnx"
+
+
 @pytest.mark.parametrize(
     "named", ["'net.onnx'", "'nets/' + name + '.onnx'", "f'{name}.onnx'", "'%s.onnx' % name"]
 )

@@ -16,6 +16,7 @@ from dynslam_bench.segmentation.carried_probability import CarriedProbability
 from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.segmentation.networks.tflite_header import read_tflite_header
 from dynslam_bench.segmentation.networks.tflite_segmenter import TfliteSegmenter
+from dynslam_bench.segmentation.schedule import MaskScheduler
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 SELFIE = Path(__file__).parents[3] / "shared/weights/selfie_segmentation.tflite"
@@ -97,6 +98,18 @@ def test_a_network_that_flickers_is_bridged_and_then_forgotten(network):
     segmenter.segment(frame(3, box))
     segmenter.reset()
     assert len(segmenter.segment(frame(4))) == 0
+
+
+def test_a_new_sequence_begins_without_the_maps_of_the_last_one(network):
+    chosen = settings(source=f"tflite:{network()}", map_decay=0.9, map_threshold=0.63, compensate=0)
+    scheduler = MaskScheduler(chosen, build_segmenter(chosen))
+    black = frame(1)
+    for resets, expected in ((False, 1), (True, 0)):
+        scheduler.reset()
+        scheduler.masks_for(frame(0, (20, 10, 44, 38)), frame(0).rgb[:, :, 0], keyframe=True)
+        if resets:
+            scheduler.reset()
+        assert len(scheduler.masks_for(black, black.rgb[:, :, 0], keyframe=True)) == expected
 
 
 def test_maps_move_with_the_image():

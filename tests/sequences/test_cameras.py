@@ -467,6 +467,8 @@ def test_the_command_line_prints_the_file_as_it_stands(tmp_path):
         ("distortion = [-1.5, 0.0, 0.0, 0.0, 0.0]", "folds the image: \\d+ % of its pixels"),
         ("distortion = [0.0, 0.0, 3.0, 0.0, 0.0]", "folds the image"),
         ("distortion = [1e200, 0.0, 0.0, 0.0, 0.0]", "folds the image"),
+        ("distortion = [1e6, 0.0, 0.0, 0.0, 0.0]", "draws a corner of the image to 0.0"),
+        ("distortion = [0.0, 0.0, 0.0, 0.0, 2e4]", "draws a corner of the image to 0."),
         ("R_body_cam = [[2.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]", "R_body_cam is no rotation"),
         ("R_body_cam = [[-1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]", "R_body_cam is no rotation"),
         ("fps = 1e-300", "'fps' is 1e-300"),
@@ -619,6 +621,26 @@ def test_a_depth_that_nobody_could_mean_is_said_where_it_is_opened(tmp_path, fac
     assert len(sequence.remarks) == bool(said)
     assert all(said in remark for remark in sequence.remarks)
     assert said in sequence.dropped
+
+
+@pytest.mark.parametrize(
+    ("share", "raw", "said"),
+    [
+        (1.0, 0, "the first depth image holds no depth"),
+        (1.0, 65535, "the first depth image holds no depth"),
+        (0.1, 65535, ""),
+        (0.1, 0, ""),
+    ],
+)
+def test_a_first_depth_image_without_depth_is_said_where_it_is_opened(tmp_path, share, raw, said):
+    folder, *_ = make_folder(tmp_path / "rec")
+    file = min((folder / "depth").iterdir())
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    image[: round(share * len(image)) or 1] = raw
+    cv2.imwrite(str(file), image)
+    sequence = open_sequence(folder)
+    assert len(sequence.remarks) == bool(said)
+    assert all(said in remark for remark in sequence.remarks)
 
 
 def test_a_true_pose_that_no_camera_reaches_is_said_where_it_is_opened(tmp_path):

@@ -172,6 +172,20 @@ def test_a_fault_is_named_and_measured(diagnosed, name):
         assert fault.value == pytest.approx(VALUES[name], rel=0.1)
 
 
+@pytest.mark.parametrize("factor", [1e3, 1e6])
+def test_a_truth_in_another_unit_is_a_fault_where_the_images_tell_no_motion(sound, factor):
+    truth = scaled(sound.ground_truth, factor)
+    compared = (sound.timestamps, truth, sound.camera, [])
+    first, second = truth_findings(*compared)
+    assert (first.severity, first.id) == ("fault", "truth-far")
+    assert "m/s by the median" in first.text
+    assert "in metres" in first.cure
+    assert (second.severity, second.id) == ("note", "motion-unmeasured")
+    assert [
+        found.id for found in truth_findings(sound.timestamps, sound.ground_truth, sound.camera, [])
+    ] == ["motion-unmeasured"]
+
+
 @pytest.mark.slow
 def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
     truths = [wander(seed)(sound.ground_truth) for seed in (0, 1)]

@@ -593,7 +593,7 @@ class Collector:
         """The files of that name, or of that ending of a network's file, in all folders below one.
 
         Of a folder with very many files the first ones are looked at; hidden folders, environments,
-        results and recordings are left out (`files_below`).
+        results and images of recordings are left out (`files_below`).
         """
         ending = _UP_TO_PLACEHOLDER.sub("", word)
         is_ending = ending.lower() in (*_NETWORKS, *_ARRAYS_AND_CLOUDS)

@@ -10,8 +10,10 @@ the file as a zip archive.
 
 from __future__ import annotations
 
+import lzma
 import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +39,16 @@ PROBABILITY_OPERATORS = {14: "LOGISTIC", 25: "SOFTMAX"}
 """Operators whose output lies between 0 and 1, by the value of BuiltinOperator."""
 MOST_ENTRIES = 100_000
 """No network has as many tensors or operators; a longer list is damage."""
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    OSError,
+)
+"""Errors of `zipfile` at damaged, encrypted or unknown archives."""
 LONGEST_LABELS = 100_000
 """Bytes of a file of labels; a longer one is none."""
 
@@ -72,7 +84,7 @@ def read_tflite_header(path: Path) -> TfliteHeader:
         SegmentationError,
         f"{path} is not a TensorFlow Lite model ({len(data)} bytes)",
         "the file is truncated or of another format",
-        of=(ValueError, IndexError, struct.error),
+        of=(ValueError, IndexError, struct.error, *_ZIP_ERRORS),
     ):
         if data[4:8] != IDENTIFIER:
             raise ValueError(f"it begins with {data[:8]!r}")
@@ -137,7 +149,9 @@ def _labels(path: Path) -> tuple[str, ...]:
         texts = [entry for entry in archive.infolist() if entry.filename.endswith(".txt")]
         if len(texts) != 1 or texts[0].file_size > LONGEST_LABELS:
             return ()
-        lines = archive.read(texts[0]).decode(errors="replace").splitlines()
+        # the size that an archive states need not be true
+        with archive.open(texts[0]) as file:
+            lines = file.read(LONGEST_LABELS).decode(errors="replace").splitlines()
     return tuple(line.strip() for line in lines if line.strip())
 
 

@@ -179,10 +179,10 @@ class RecordedSequence:
         )
 
     def _doubtful_depth(self, depth: NDArray[np.float32]) -> str:
-        """A phrase where the first image's median depth is in no unit that its factor can mean; empty otherwise."""
+        """A phrase where the first image holds no depth, or one that its factor cannot mean; empty otherwise."""
         measured = depth[depth > 0]
         if not len(measured):
-            return ""
+            return "the first depth image holds no depth"
         median = float(np.median(measured))
         if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
             return ""

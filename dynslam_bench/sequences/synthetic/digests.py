@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from dynslam_bench.sequences.synthetic import open_synthetic
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 
 
@@ -30,3 +31,8 @@ def rendered_digest(sequence: SyntheticSequence, indices: Iterable[int] | None =
         ):
             state.update(np.ascontiguousarray(array, dtype=kind).tobytes())
     return state.hexdigest()
+
+
+def probe_digest(probe: str) -> str:
+    """The digest of a probe as this machine renders it; nothing stored is read."""
+    return rendered_digest(open_synthetic(probe, None))

@@ -45,6 +45,9 @@ _OPTIONS = {
 """Options behind the question mark of an id, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
+PROBE_FRAMES = 2
+"""Frames of a public scene that tell machines apart: the second has motion blur of what moves."""
+
 
 @dataclass(frozen=True)
 class SyntheticId:
@@ -127,3 +130,8 @@ def parse_synthetic_id(text: str) -> SyntheticId:
             )
         options[key] = int(value)
     return replace(SyntheticId(name, frames=VARIANTS[name].frames), **options)  # type: ignore[arg-type]  # all integers
+
+
+def probe_id(family: str) -> str:
+    """The id of the public scene whose bits tell machines apart that render a family."""
+    return f"synthetic/{family}?scene=0&frames={PROBE_FRAMES}"

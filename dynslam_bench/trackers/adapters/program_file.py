@@ -339,6 +339,17 @@ class BatchProgram(ProgramFile):
         check_inside(output, "output")
         return output
 
+    @model_validator(mode="after")
+    def _is_written_by_the_program(self) -> "BatchProgram":
+        """Refuse a template that makes the output: it would be scored where the program writes nothing."""
+        for target in self.templates:
+            if os.path.normpath(target) == os.path.normpath(self.output):
+                raise ValueError(
+                    f"output: '{self.output}' is made of the template '{self.templates[target]}' before the program "
+                    "starts: name the file that the program writes"
+                )
+        return self
+
 
 class ServedProgram(ProgramFile):
     """Content of the TOML file of `subprocess:FILE`, a program that answers frame by frame.

@@ -25,6 +25,10 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
+from dynslam_bench.geometry.motion_covariances import (
+    MotionCovariances,
+    write_motion_covariances,
+)
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS, open_sequence, sequence_ids
 from dynslam_bench.testing import (
@@ -39,6 +43,7 @@ from dynslam_bench.trackers.adapters import odometry as opencv_odometry
 from dynslam_bench.trackers.adapters.odometry import FrameToFrame
 from dynslam_bench.trackers.adapters.orbslam3 import check_camera, find_vocabulary, settings_yaml
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
+from dynslam_bench.trackers.adapters.subprocess_tracker import read_track_answer
 from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.systems.composition import SystemSettings, compose
 
@@ -124,6 +129,21 @@ def test_replay_skips_a_hole(trajectory, tmp_path):
     tracker = reset(build_tracker(f"replay:{holed}"))
     states = [tracker.track(blank(i, stamp)).state for i, stamp in enumerate(stamps)]
     assert states == ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 12
+
+
+def test_replay_gives_the_covariances_of_a_file(trajectory, tmp_path):
+    path, stamps, _ = trajectory
+    file = tmp_path / "covariances.txt"
+    matrices = np.array([np.eye(6) * (k + 1) for k in range(19)])
+    write_motion_covariances(file, MotionCovariances(stamps[1:], matrices))
+    settings = {"covariances": str(file)}
+    tracker = reset(build_tracker(f"replay:{path}", settings))
+    results = [tracker.track(blank(k, float(stamp))) for k, stamp in enumerate(stamps)]
+    assert results[0].motion_covariance is None
+    assert [result.motion_covariance[0, 0] for result in results[1:]] == list(range(1, 20))
+    file.write_text("1 2\n")
+    with pytest.raises(TrajectoryError, match="has 2 values, not the 37"):
+        build_tracker(f"replay:{path}", settings)
 
 
 def test_replay_id_carries_the_file(trajectory):
@@ -608,3 +628,25 @@ def test_frames_without_features():
         )
         assert tracker.track(seen).state == "ok"
         assert tracker.finalize().timestamps.tolist() == [4 / 30]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (np.eye(6).ravel().tolist(), np.eye(6)),
+        (np.eye(6).tolist(), np.eye(6)),
+        ([1.0, 2.0], np.full((6, 6), np.nan)),
+        ("sure", np.full((6, 6), np.nan)),
+        ({"a": 1}, np.full((6, 6), np.nan)),
+        ([1e12] * 36, np.full((6, 6), 1e12)),
+        (None, None),
+    ],
+)
+def test_a_program_may_answer_with_a_covariance(given, expected):
+    answer = {"index": 0, "state": "ok", "T_world_cam": np.eye(4).ravel().tolist()}
+    answer["motion_covariance"] = given
+    result = read_track_answer(answer, blank(0, 0.0), "program", lambda: 0.0)
+    if expected is None:
+        assert result.motion_covariance is None
+    else:
+        assert np.array_equal(result.motion_covariance, expected, equal_nan=True)

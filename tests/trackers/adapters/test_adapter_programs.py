@@ -563,7 +563,13 @@ def toml(tmp_path):
             "command": [sys.executable, "slam.py", *words],
         } | fields
         path = tmp_path / "slam.toml"
-        path.write_text("".join(f"{name} = {value!r}\n" for name, value in given.items()))
+        lines = []
+        for name, value in given.items():
+            if isinstance(value, dict):
+                lines += [f"{name}.{key!r} = {text!r}\n" for key, text in value.items()]
+            else:
+                lines.append(f"{name} = {value!r}\n")
+        path.write_text("".join(lines))
         return path
 
     return write
@@ -831,6 +837,15 @@ def test_one_that_never_ends_is_killed_with_what_it_started(toml, toy_folder, tm
         ({"output": "a/../../traj.txt"}, "is no file in the program's working folder"),
         ({"output": "~/traj.txt"}, "is no file in the program's working folder"),
         ({"output": ""}, "is no file in the program's working folder"),
+        (
+            {"templates": {"trajectory.txt": "old.txt"}},
+            "output: 'trajectory.txt' is made of the template 'old.txt' before the program starts",
+        ),
+        ({"templates": {".//trajectory.txt": "old.txt"}}, "is made of the template"),
+        (
+            {"output": "a/traj.txt", "templates": {"a/./traj.txt": "old.txt"}},
+            "is made of the template",
+        ),
         ({"exit_codes": []}, "exit_codes"),
         ({"exit_codes": [300]}, "exit_codes"),
         ({"exit_codes": ["ok"]}, "exit_codes"),
