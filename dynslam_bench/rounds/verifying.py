@@ -129,12 +129,12 @@ def verify(
         on_event=on_event,
     )
     rows_again = {(row.entry, row.sequence): row for row in again.made}
-    for _, row in pairs:
-        made = rows_again.get(row.key)
+    for _, published in pairs:
+        made = rows_again.get(published.key)
         if made is None:
-            verification.faults.append(f"{_named(opened, row.row)} could not be run again")
+            verification.faults.append(f"{_named(opened, published.row)} could not be run again")
             continue
-        verification.rerun.append(_compared(opened, row, scored(opened, by, made)))
+        verification.rerun.append(_compared(opened, published, scored(opened, by, made)))
     for rerun in verification.rerun:
         if rerun.agreement == "differs":
             verification.faults.append(
