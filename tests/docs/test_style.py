@@ -7,9 +7,10 @@ import statistics
 from pathlib import Path
 
 import pytest
-import results
 from helpers.documented_names import PAGES as WRITTEN
 from helpers.documented_names import ROOT, read, sources
+
+import results
 
 LONGEST = 35
 MEDIAN = 18
