@@ -121,7 +121,7 @@ def truth_findings(
 def _findings_by_images(
     stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair]
 ) -> list[Finding]:
-    """What the truth of a recording does not share with the motion that its images show; see `truth_findings`."""
+    """Findings on what the truth does not share with the motion that the images show; see `truth_findings`."""
     usable = [
         pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5
     ]
