@@ -144,7 +144,7 @@ class FileGroup:
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """What metadata and card say of a data set.
+    """Facts that metadata and card state of a data set.
 
     Attributes:
         folder: Where its files are.
