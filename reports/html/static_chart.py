@@ -1,6 +1,7 @@
 """Static pictures of the board's two charts of errors, for readers without scripts: their points and lines as SVG."""
 
 import html
+import math
 from typing import Any
 
 import numpy as np
@@ -40,12 +41,13 @@ def static_chart(figure: go.Figure) -> Markup:
     high = float(errors.max()) + 0.05
 
     def x_of(error_mm: float) -> float:
-        return left + (right - left) * (np.log10(max(error_mm, 10**low)) - low) / (high - low)
+        share = (math.log10(max(error_mm, 10**low)) - low) / (high - low)
+        return float(left + (right - left) * share)
 
     def y_of(value: Any) -> float:
         lowest, highest = layout.yaxis.range
         place = names.index(value) if names else value
-        return bottom - (bottom - 10) * (place - lowest) / (highest - lowest)
+        return float(bottom - (bottom - 10) * (place - lowest) / (highest - lowest))
 
     # the grid with its labels
     parts = []
