@@ -47,9 +47,9 @@ def logarithm(pose):
 
 
 def random_covariance(rng, sizes=(0.002, 0.002, 0.004, 0.001, 0.001, 0.0005)):
-    root = rng.normal(size=(6, 6)) + 2 * np.eye(6)
+    root = rng.normal(size=(6, 6)) + 5 * np.eye(6)
     scale = np.diag(sizes)
-    return scale @ root @ root.T @ scale / 6
+    return scale @ root @ root.T @ scale / 30
 
 
 def simulated(count, seed=0, *, truth_sigma=(0.0, 0.0)):
