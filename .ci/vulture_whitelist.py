@@ -128,6 +128,7 @@ pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
 dynslam_gate  # a fixture of pytest
 reran_baseline  # a field of gate.json
+entered  # a field of an entry of a round
 _.runtest  # pytest calls it
 _.reportinfo  # pytest calls it
 

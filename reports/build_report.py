@@ -681,7 +681,12 @@ def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
             "Not ranked, as another program of the same tracker and settings ranks, or as the runs' ids are "
             f"unverified: {', '.join(others)}."
         )
-    absent = [f"{board.labels[key]} ({changed})" for key, changed in loaded.not_installed.items()]
+    # a category lacks the trackers that were not run on its sequences
+    absent = [
+        f"{board.labels[key]} ({changed})"
+        for key, changed in loaded.not_installed.items()
+        if key in board.labels
+    ]
     if absent:
         notes.append(
             "Ranked by the program of their newest run, as none of several is the one installed here: "
@@ -690,6 +695,7 @@ def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
     in_future = [
         f"{row.label} on {row.sequence.id}, {row.repeat} ({row.started[:10]}, run {row.run_id})"
         for row in loaded.in_future
+        if row.variant_key in board.labels
     ]
     if in_future:
         notes.append(

@@ -68,6 +68,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     is_worker = hasattr(session.config, "workerinput")
     if is_worker or not getattr(session.config.option, "numprocesses", None):
         return
+    gc.enable()  # the workers collect the tests, not this process
     # even where everything lies compiled, loading it takes 25 s of processor
     stamp = kernels_stamp()
     if stamp.exists():

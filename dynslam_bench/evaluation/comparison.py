@@ -444,8 +444,10 @@ def share_of_time(stamps: ArrayLike, true_stamps: ArrayLike) -> float:
     """
     poses = np.asarray(stamps, dtype=np.float64)
     truth = np.asarray(true_stamps, dtype=np.float64)
+    if min(len(poses), len(truth)) < 2:
+        return 0.0
     whole_s = float(truth[-1] - truth[0])
-    if len(poses) < 2 or whole_s <= 0:
+    if whole_s <= 0:
         return 0.0
 
     # steps between poses, as far as they lie within the truth's time

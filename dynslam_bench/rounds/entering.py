@@ -31,7 +31,7 @@ TRIAL_SCENE = 100
 TRIAL_FRAMES = 60
 """Frames of the trial at most: two seconds."""
 _PROGRAMS = ("subprocess:", "batch:")
-"""How the names of trackers begin that are programs, whose files no package holds."""
+"""Beginnings of the names of trackers that are programs, whose files no package holds."""
 
 
 def enter(

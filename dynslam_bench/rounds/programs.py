@@ -38,7 +38,7 @@ def program_of(name: str, identity: Mapping[str, Any]) -> Program:
 
     Args:
         name: Name of the entry, whose files lie in ``entries/NAME``, or beside the plug-in.
-        identity: As a run's record has it, or as `ResolvedRun.stated` gives it before the run: then
+        identity: As a run's record has it, or as `ResolvedRun.identity` gives it before the run: then
             what a plug-in reads is not known yet.
     """
     # the code: of each part, of packages that the tracker needs, its own version
@@ -89,7 +89,7 @@ def what_changed(entry: Entry, root: Path, sequence: str) -> str:
     folders = BaseFolders(plugin=resolved.base_folders.plugin, work=root)
     if changed := Verifier().changed(Reads(files=entry.program.files), folders):
         return changed
-    return difference(entry.program, program_of(entry.name, resolved.stated))
+    return difference(entry.program, program_of(entry.name, resolved.identity))
 
 
 def difference(frozen: Program, now: Program) -> str:

@@ -1,4 +1,4 @@
-"""What a bank holds beside its runs: its description, and marks of who has run a row again."""
+"""Files of a bank beside its runs: its description, and marks of who has run a row again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Name = Annotated[str, Field(pattern=NAME)]
 
 
 class BankDescription(Record):
-    """What holds for a whole bank.
+    """Facts that hold for a whole bank.
 
     Attributes:
         schema_version: Version of this record's fields.
@@ -124,7 +124,7 @@ class Mark(Record):
         return f"{self.by}: {difference}, {self.machine.cpu}"
 
     def fault(self, description: BankDescription, rows: Iterable[str]) -> str:
-        """What is wrong with it in a bank of these rows; empty for nothing."""
+        """Fault of the mark in a bank of these rows; empty for none."""
         if self.run_id not in rows:
             return f"there is no row {self.run_id}"
         if self.protocol != description.protocol:

@@ -222,7 +222,7 @@ def _resolved(
         )
 
     # settings whose defaults another release has changed, and data that are not the row's
-    here = resolved.stated.get("settings", flatten(resolved.settings))
+    here = resolved.identity.get("settings", flatten(resolved.settings))
     for name, value in record.identity.get("settings", {}).items():
         if here.get(name) != value:
             raise RunError(

@@ -24,7 +24,7 @@ _ERROR_TOLERANCE_M = 1e-9
 
 @dataclass(frozen=True)
 class Checked:
-    """What was checked of a submission.
+    """Outcome of the checks of a submission.
 
     Attributes:
         checker: Name and version of the rules.
@@ -87,7 +87,7 @@ def check_submission(submission: str | Path, bank: str | Path | None = None) -> 
 
 
 def _faults_of_row(store: Bank, record: RunRecord, description: BankDescription) -> Iterator[str]:
-    """What keeps a row from being accepted, a line each."""
+    """Faults that keep a row from being accepted, a line each."""
     if record.trial_of:
         yield f"it is a trial of the study '{record.trial_of}', no result"
     if record.kind == "imported" and not record.provenance:

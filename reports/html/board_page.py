@@ -132,12 +132,12 @@ def _run_cells(
     marks = cells["tracker"].text.removeprefix(board.labels[key])
     name = replace(cells["tracker"], text=board.names[key] + marks, link=run_link(linked))
 
-    # the successes lead to the first failure
+    # the successes lead to the first failure, and say how that ended
     success = cells["success"]
     failure = next((run for run in runs if run.failed), None)
     if failure is not None:
         tip = f"{board.sequence(failure)}: {failure.ending}"
-        success = replace(success, link=run_link(failure), tip=tip)
+        success = replace(success, small=failure.ending, link=run_link(failure), tip=tip)
     return {
         "name": name,
         "kind": TableCell("imported") if first.imported else cells["provenance"],

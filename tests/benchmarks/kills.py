@@ -26,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,6 +104,8 @@ include = ["gain", "wobble"]
 
 
 JOURNAL = Path("studies/study/journal.log")
+NEED_RUNS = {"report", "merge", "bank"}
+"""The commands whose input are stored runs."""
 LOOK_S = 0.001
 """Seconds between two looks at how far a result has come."""
 
@@ -225,8 +227,8 @@ class Command:
         return self.start(target).wait()
 
 
-def make_commands(folder: Path) -> dict[str, Command]:
-    """The commands, on inputs that are made below a folder."""
+def make_commands(folder: Path, names: list[str]) -> dict[str, Command]:
+    """The commands, on inputs that are made below a folder: those that the named commands need."""
     sequences = [str(make_sequence(folder / f"s{number}", 0.5 * number)) for number in range(4)]
     (folder / "drifting.py").write_text(TRACKER)
     tracker = json.dumps(f"{folder / 'drifting.py'}:SPEC")
@@ -243,9 +245,12 @@ def make_commands(folder: Path) -> dict[str, Command]:
     )
     bench = Command(["bench", str(suite), "--results", "{target}"], runs_of)
     repository = make_repository(folder / "repository", sequences[:2])
+    # stored runs take minutes to make
     results = folder / "results"
-    assert bench.finish(results) == 0, results.with_suffix(".log").read_text()
-    shards = [str(shard) for shard in split(results, folder)]
+    shards = [str(folder / f"shard{number}") for number in range(2)]
+    if not NEED_RUNS.isdisjoint(names):
+        assert bench.finish(results) == 0, results.with_suffix(".log").read_text()
+        split(results, shards)
     return {
         "bench": bench,
         "tune": Command(["tune", "run", str(study), "--results", "{target}"], study_of),
@@ -282,15 +287,13 @@ def make_repository(folder: Path, sequences: list[str]) -> Path:
     return folder
 
 
-def split(results: Path, folder: Path) -> Iterator[Path]:
-    """Two results folders, each with half of the runs of one."""
+def split(results: Path, shards: list[str]) -> None:
+    """Copy the runs of one results folder into several, each of which gets its share."""
     run_ids = RunStore(results).ids()
-    for number in range(2):
-        shard = folder / f"shard{number}"
+    for number, shard in enumerate(map(Path, shards)):
         shutil.copytree(results / "sequences", shard / "sequences")
-        for run_id in run_ids[number::2]:
+        for run_id in run_ids[number :: len(shards)]:
             shutil.copytree(results / "runs" / run_id, shard / "runs" / run_id)
-        yield shard
 
 
 # -- kills
@@ -416,7 +419,7 @@ def main() -> int:
         + "|"
     )
     with tempfile.TemporaryDirectory() as folder:
-        commands = make_commands(Path(folder))
+        commands = make_commands(Path(folder), options.commands)
         tallies = []
         for name in options.commands:
             random = Random(f"{options.seed} {name}")

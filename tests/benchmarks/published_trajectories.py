@@ -4,7 +4,8 @@
 
 The folder holds ``rgbd-vo/SEQUENCE/`` (EdwardjkFeng/rgbd-vo, commit 49ff0b8): trajectories, the
 publisher's truth, and the author's tables of ``evo_ape -as`` as ``published.csv``. It holds
-``authors/NAME/`` too: single trajectories.
+``authors/NAME/`` too: single trajectories, and ``modification_orb/SEQUENCE/``
+(Sujan-PhdWork/modification_orb, commit 2cb9904): best tracks, truth, and one ``published.csv``.
 """
 
 import argparse
@@ -90,9 +91,36 @@ def single(folder: Path) -> None:
         print(f"| {name} | {result.metrics['ate_rmse_m']:.4f} | {result.n_pairs} |")
 
 
+TUM_STATISTICS = ("rmse", "mean", "median", "std")
+"""What the author of ``modification_orb`` gives of TUM's `evaluate_ate.py`."""
+
+
+def tum_agreement(folder: Path) -> None:
+    """How many numbers of an author who used TUM's script come out under ``tum-rgbd/v1``."""
+    print("| sequence | numbers | agree to 1e-6 m | largest difference (m) |")
+    print("| --- | ---: | ---: | ---: |")
+    own = folder / "modification_orb"
+    for line in csv.DictReader((own / "published.csv").open()):
+        files = (
+            own / line["sequence"] / line["trajectory"],
+            own / line["sequence"] / "groundtruth.txt",
+        )
+        metrics = evaluate_files(*files, "tum-rgbd/v1").metrics
+        differences = [
+            abs(metrics[f"ate_{name}_m"] - float(line[f"{name}_m"])) for name in TUM_STATISTICS
+        ]
+        good = sum(difference < 1e-6 for difference in differences)
+        print(f"| {line['sequence']} | {len(differences)} | {good} | {max(differences):.0e} |")
+
+
 def main() -> None:
     """Print one of the tables."""
-    tables = {"agreement": agreement, "conventions": conventions, "single": single}
+    tables = {
+        "agreement": agreement,
+        "conventions": conventions,
+        "single": single,
+        "tum": tum_agreement,
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -7,9 +7,11 @@ import pytest
 from helpers.reports_fake_store import PROTOCOL, add_run, crashed, page_data, row
 
 from dynslam_bench.reports import build_report
+from dynslam_bench.reports.build_report import _board_notes
 from dynslam_bench.reports.html.board_page import ranking_entries
 from dynslam_bench.reports.model.answers import answers, error_columns, limits, typical_error
 from dynslam_bench.reports.model.board import category_boards, make_board, more_sequences
+from dynslam_bench.reports.model.load import LoadedRuns
 from dynslam_bench.reports.model.statistics import FEWEST
 from dynslam_bench.reports.tables.leaderboard import leaderboard
 from dynslam_bench.reports.tables.quotes import bibtex, quotes
@@ -148,6 +150,37 @@ def test_notes_of_a_tab_speak_of_its_trackers_only(store, tmp_path):
     assert "Missing cells" not in panels["high dynamic"]
     # the tracker that was not run there has no row
     assert ">other</a>" not in panels["low dynamic"]
+
+
+def test_notes_on_programs_speak_of_a_tab_s_trackers_only():
+    boards = category_boards(make_board(mixed()))
+    labels = boards["overall"].labels
+    short = next(key for key, label in labels.items() if label.startswith("SHORT"))
+    assert short not in boards["low dynamic"].labels
+    loaded = LoadedRuns(not_installed={short: "other code"})
+    assert any(
+        f"{labels[short]} (other code)" in note for note in _board_notes(boards["overall"], loaded)
+    )
+    assert not any("other code" in note for note in _board_notes(boards["low dynamic"], loaded))
+
+
+def test_failures_are_counted_by_tracker():
+    board = make_board(mixed())
+    assert f"1 of {len(board.rows)} runs failed (FAST 1) and counts as not moving" in limits(board)
+    assert "failed" not in limits(make_board([run for run in mixed() if not run.failed]))
+
+
+def test_an_import_of_a_part_says_how_much_of_the_time_it_covers():
+    rows = [final_only("whole", name, 0.01) for name in WALKS]
+    for name in WALKS:
+        half = final_only("half", name, 0.005)
+        rows.append(half.model_copy(update={"coverage": None, "truth_share": 0.6}))
+    board = make_board(rows)
+    (told,) = answers(board)
+    assert "HALF 5.00 mm (final trajectory, 60 % of the time)" in told
+    assert "WHOLE 10.0 mm (final trajectory)" in told
+    (entry,) = [e for e in ranking_entries(board, board, {}) if e["name"].text == "HALF"]
+    assert entry["coverage"].text == "60 % of the truth's time"
 
 
 def test_quotes_hold_the_numbers_of_the_view():

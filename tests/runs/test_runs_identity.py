@@ -464,3 +464,32 @@ def test_a_plug_in_that_patches_numpy_changes_no_score(
         assert together.score(beside).metrics == before
     finally:
         np.sqrt = original
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_plug_in_that_patches_numpy_reaches_no_run_of_another(
+    order: tuple[int, int], tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynslam_bench.runs.store.has_imported_plugins", has_imported_plugins)
+    spec, _ = a_plug_in(tmp_path)
+    patching = PLUGIN + "\nnp.cbrt = lambda _: 9.0\n"
+    looking = PLUGIN.replace("= gain", "= np.cbrt(8.0)")
+    assert looking != PLUGIN
+    trackers = {
+        name: write(tmp_path / name / f"{name}.py", source.replace('"mine"', f'"{name}"'))
+        for name, source in (("patching", patching), ("looking", looking))
+    }
+    for file in trackers.values():
+        write(file.parent / "helper.py", "def gain(text):\n    return len(text)\n")
+        write(file.parent / "params" / "slam.yaml", "threshold: 1\n")
+    # one is imported by this process, which asks for both
+    specs = [spec.model_copy(update={"tracker": f"{file}:SPEC"}) for file in trackers.values()]
+    original = np.cbrt
+    try:
+        records = run_many([specs[index] for index in order], results=store)
+        assert np.cbrt is not original, "the plug-in has patched numpy in this process"
+    finally:
+        np.cbrt = original
+    (looked,) = [record for record in records if record.tracker.id == "looking"]
+    assert looked.status == "ok", looked.reason
+    assert store.trajectory(looked.run_id).positions[0, 0] == 2.0

@@ -38,6 +38,7 @@ _CONTEXT: dict[str, Any] = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "extract": "cr:extract",
     "field": "cr:field",
@@ -59,6 +60,7 @@ _CONTEXT: dict[str, Any] = {
     "regex": "cr:regex",
     "repeated": "cr:repeated",
     "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
     "sc": "https://schema.org/",
     "separator": "cr:separator",
     "source": "cr:source",
@@ -66,6 +68,9 @@ _CONTEXT: dict[str, Any] = {
     "transform": "cr:transform",
 }
 """The context of the specification, with the prefixes of RAI and PROV."""
+_CITATION = (
+    "dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes"
+)
 _LICENCES = {
     "CC0-1.0": "https://creativecommons.org/publicdomain/zero/1.0/",
     "CC BY 4.0": "https://creativecommons.org/licenses/by/4.0/",
@@ -88,6 +93,32 @@ _IMPACT = (
 
 
 @dataclass(frozen=True)
+class RecordField:
+    """A field of the records that a group of files holds.
+
+    Attributes:
+        name: Its name.
+        data_type: Its type in schema.org's terms.
+        source: ``content`` or ``lines`` of a file, or a path into its JSON, e.g. ``$.run_id``.
+    """
+
+    name: str
+    data_type: str
+    source: str
+
+    @property
+    def extract(self) -> dict[str, str]:
+        """How a reader gets it out of a file."""
+        if self.source.startswith("$"):
+            return {"jsonPath": self.source}
+        return {"fileProperty": self.source}
+
+
+_IMAGE = (RecordField("image", "sc:ImageObject", "content"),)
+_LINES = (RecordField("line", "sc:Text", "lines"),)
+
+
+@dataclass(frozen=True)
 class FileGroup:
     """Files of one kind in a data set.
 
@@ -96,12 +127,14 @@ class FileGroup:
         pattern: Their names, e.g. ``rgb/*.png``; a plain name for a single file.
         media_type: Their media type.
         meaning: What they hold.
+        fields: Fields of the records in them; none for files that are no records.
     """
 
     id: str
     pattern: str
     media_type: str
     meaning: str
+    fields: tuple[RecordField, ...] = ()
 
     @property
     def is_single(self) -> bool:
@@ -111,7 +144,7 @@ class FileGroup:
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """What metadata and card say of a data set.
+    """Facts that metadata and card state of a data set.
 
     Attributes:
         folder: Where its files are.
@@ -227,15 +260,21 @@ def _facts_of_rendered(folder: Path) -> DatasetFacts:
         title=f"Rendered RGB-D sequence {scene}",
         summary="RGB-D images of a dynamic indoor scene with exact poses, depth and masks, in TUM's layout.",
         licences=("CC0-1.0",),
-        citation="dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes",
+        citation=_CITATION,
         files=(
-            FileGroup("rgb", "rgb/*.png", "image/png", "colour images, 640x480, 8 bits"),
-            FileGroup("depth", "depth/*.png", "image/png", "depth images, 16 bits, metres x 5000"),
-            FileGroup("masks", "masks/*.png", "image/png", "exact instances, 0 is the background"),
+            FileGroup("rgb", "rgb/*.png", "image/png", "colour images, 640x480, 8 bits", _IMAGE),
+            FileGroup(
+                "depth", "depth/*.png", "image/png", "depth images, 16 bits, metres x 5000", _IMAGE
+            ),
+            FileGroup(
+                "masks", "masks/*.png", "image/png", "exact instances, 0 is the background", _IMAGE
+            ),
             FileGroup("rgb-list", "rgb.txt", "text/plain", "stamp and file of each image"),
             FileGroup("depth-list", "depth.txt", "text/plain", "stamp and file of each image"),
             FileGroup("masks-list", "masks.txt", "text/plain", "stamp and file of each image"),
-            FileGroup("poses", "groundtruth.txt", "text/plain", "exact poses, camera to world"),
+            FileGroup(
+                "poses", "groundtruth.txt", "text/plain", "exact poses, camera to world", _LINES
+            ),
             FileGroup("camera", "camera.toml", "application/toml", "intrinsics and frame rate"),
         ),
         limitations=_RENDERED_LIMITS,
@@ -265,7 +304,17 @@ def _facts_of_minari(folder: Path) -> DatasetFacts:
     numbers = {words: str(stated[key]) for key, words in wanted.items() if key in stated}
     name = str(stated.get("dataset_id", folder.name))
     contents = [
-        FileGroup("metadata", "data/metadata.json", "application/json", "spaces and counts"),
+        FileGroup(
+            "metadata",
+            "data/metadata.json",
+            "application/json",
+            "spaces and counts",
+            (
+                RecordField("data set", "sc:Text", "$.dataset_id"),
+                RecordField("episodes", "sc:Integer", "$.total_episodes"),
+                RecordField("steps", "sc:Integer", "$.total_steps"),
+            ),
+        ),
     ]
     if (folder / "data" / "main_data.hdf5").is_file():
         contents.append(
@@ -282,7 +331,7 @@ def _facts_of_minari(folder: Path) -> DatasetFacts:
         title=f"Recordings of SLAM-Control: {name}",
         summary="Episodes of agents that change the settings of a SLAM system at every frame of a rendered sequence.",
         licences=("CC0-1.0",),
-        citation="dynslam-bench: a Gymnasium benchmarking and tuning toolkit for visual SLAM in dynamic scenes",
+        citation=_CITATION,
         files=tuple(contents),
         limitations=f"{_RENDERED_LIMITS} Rewards hold for one tracker and its version.",
         biases=f"{_RENDERED_BIASES} Actions are those of the recorded policies.",
@@ -312,9 +361,21 @@ def _facts_of_bank(folder: Path) -> DatasetFacts:
     rendered = [name for name in sequences if name.startswith("synthetic/")]
     recorded = sorted(sequences.keys() - set(rendered))
     derived = [(name, "") for name in recorded]
+    cited = sorted({info.citation for info in sequences.values() if info.citation})
     derived += [(f"{len(rendered)} rendered sequences of dynslam-bench", "")] if rendered else []
     contents = [
-        FileGroup("records", "runs/*/run.json", "application/json", "tracker, settings, machine"),
+        FileGroup(
+            "records",
+            "runs/*/run.json",
+            "application/json",
+            "tracker, settings, machine",
+            (
+                RecordField("row", "sc:Text", "$.run_id"),
+                RecordField("tracker", "sc:Text", "$.tracker.id"),
+                RecordField("sequence", "sc:Text", "$.sequence.id"),
+                RecordField("status", "sc:Text", "$.status"),
+            ),
+        ),
         FileGroup("trajectories", "runs/*/trajectory_*.txt", "text/plain", "estimated poses"),
         FileGroup("stamps", "sequences/*/timestamps.txt", "text/plain", "stamps of the frames"),
         FileGroup("truth", "sequences/*/groundtruth.txt", "text/plain", "ground truth"),
@@ -332,7 +393,7 @@ def _facts_of_bank(folder: Path) -> DatasetFacts:
         summary=f"{len(records)} trajectories of {len(trackers)} SLAM systems on {len(sequences)} sequences, "
         f"with ground truth; errors are under the protocol {protocol.id}.",
         licences=tuple(sorted(licences)),
-        citation="; ".join(sorted({i.citation for i in sequences.values() if i.citation})),
+        citation="; ".join(cited) or _CITATION,
         files=tuple(contents),
         limitations="Errors hold for these sequences, settings and machines. A row that nobody has run again is its "
         "owner's word; an imported one names where it comes from.",
@@ -388,7 +449,7 @@ def croissant(facts: DatasetFacts, *, url: str, creator: str, today: date) -> di
         "prov:wasDerivedFrom": [_entity(name, place) for name, place in facts.derived_from],
         "prov:wasGeneratedBy": [{"@type": "prov:Activity", "prov:label": facts.made_by}],
         "distribution": [_distribution(facts.folder, group) for group in _present(facts)],
-        "recordSet": [_record_set(group) for group in _present(facts) if _has_records(group)],
+        "recordSet": [_record_set(group) for group in _present(facts) if group.fields],
     }
     return metadata
 
@@ -421,17 +482,10 @@ def _distribution(folder: Path, group: FileGroup) -> dict[str, Any]:
     }
 
 
-def _has_records(group: FileGroup) -> bool:
-    """Whether the files of a group are records of the data set: images, lines of text, JSON."""
-    return group.id in ("rgb", "depth", "masks", "poses", "records", "metadata")
-
-
 def _record_set(group: FileGroup) -> dict[str, Any]:
-    """The records of a group of files: images, lines, or JSON texts."""
-    source = {"fileObject" if group.is_single else "fileSet": {"@id": group.id}}
-    extracts = {"image/png": ("sc:ImageObject", "content"), "text/plain": ("sc:Text", "lines")}
-    data_type, file_property = extracts.get(group.media_type, ("sc:Text", "content"))
+    """The records that a group of files holds."""
     name = f"{group.id}-records"
+    files = {"fileObject" if group.is_single else "fileSet": {"@id": group.id}}
     return {
         "@type": "cr:RecordSet",
         "@id": name,
@@ -440,12 +494,13 @@ def _record_set(group: FileGroup) -> dict[str, Any]:
         "field": [
             {
                 "@type": "cr:Field",
-                "@id": f"{name}/{file_property}",
-                "name": file_property,
-                "description": group.meaning,
-                "dataType": data_type,
-                "source": source | {"extract": {"fileProperty": file_property}},
+                "@id": f"{name}/{part.name.replace(' ', '-')}",
+                "name": part.name.replace(" ", "-"),
+                "description": part.name,
+                "dataType": part.data_type,
+                "source": files | {"extract": part.extract},
             }
+            for part in group.fields
         ],
     }
 

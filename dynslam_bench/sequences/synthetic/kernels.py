@@ -392,7 +392,7 @@ def lies_on_edge(hit: Ints, row: int, column: int) -> bool:
     """Whether one of a pixel's four neighbours shows another surface; `hit` as in `cast_geometry`."""
     height, width = hit.shape
     surface = hit[row, column]
-    return (
+    return bool(
         (column > 0 and hit[row, column - 1] != surface)
         or (column + 1 < width and hit[row, column + 1] != surface)
         or (row > 0 and hit[row - 1, column] != surface)
