@@ -31,7 +31,7 @@ SYMMETRY = 1e-5
 POSITIVE = 1e-9
 """Least eigenvalue of a matrix of correlations; a smaller one is zero or negative by rounding."""
 SECOND_S = 1.0
-SECOND_TOLERANCE = 0.1
+SECOND_TOLERANCE = 0.05
 """Share of a second by which the span of two frames may miss it."""
 LONGEST_GAP_S = 0.1
 """Between true poses farther apart none is interpolated."""

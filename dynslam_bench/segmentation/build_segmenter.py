@@ -117,7 +117,7 @@ SEGMENTERS: Registry[SegmenterSpec] = Registry("segmenters", SegmenterSpec, _bui
 class NetworkNotFetched(SegmentationError):
     """``auto`` needs a network that is not in the cache; the user is asked before it is downloaded."""
 
-    checkpoint: Checkpoint = SELFIE
+    checkpoint: Checkpoint = COCO
 
 
 def resolve_source(
@@ -136,26 +136,27 @@ def resolve_source(
         optional: Whether the tracker also works without masks, for the hint.
 
     Returns:
-        ``auto`` becomes ``embedded``, ``coco`` or ``selfie``; everything else stays as it is.
+        ``auto`` becomes ``embedded`` or ``coco``; everything else stays as it is.
 
     Raises:
-        NetworkNotFetched: ``auto`` needs a network, and none is in the cache; lists the
-            alternatives.
+        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the
+            alternatives with their sizes and licences.
     """
     if settings.source != "auto":
         return settings.source
 
-    # auto: the embedded network on what it was trained for, else the best network that is there
+    # auto: the embedded network on what it was trained for, else the COCO checkpoint if it is there;
+    # the small network is worse than no masks on some recordings, so that the user has to name it
     if sequence_id.startswith("synthetic/"):
         return "embedded"
-    for checkpoint in (COCO, SELFIE):
-        if cached_checkpoint(checkpoint) is not None:
-            return checkpoint.id
+    if cached_checkpoint(COCO) is not None:
+        return "coco"
 
     # neither: list what the user may choose
     options = [
-        f"--yes (run, bench) or segmentation.source=selfie downloads it once; segmentation.source=coco takes "
-        f"torchvision's ({COCO.megabytes:g} MB, {COCO.license}), which knows {len(COCO_NAMES)} classes",
+        f"--yes (run, bench) or segmentation.source=coco downloads it once ({COCO.license})",
+        f"segmentation.source=selfie downloads a small network of people indoors ({SELFIE.megabytes:g} MB, "
+        f"{SELFIE.license})",
         "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
         "segmentation.source=recorded:DIR takes masks that were stored before",
     ]
@@ -167,8 +168,7 @@ def resolve_source(
         options.append("without masks: a tracker such as 'emfoa-oft?masks=none' or orb-slam2")
     raise NetworkNotFetched(
         f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
-        f"a network, and none is in the cache; '{SELFIE.id}' finds people indoors ({SELFIE.megabytes:g} MB, "
-        f"{SELFIE.license})",
+        f"the COCO checkpoint ({COCO.megabytes:g} MB), which is not in the cache",
         options=options,
     )
 

@@ -296,7 +296,7 @@ class SegmentationSettings(Settings):
 
     source: str = "auto"
     """Source of masks: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
-    was fetched, in this order), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
+    fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
     (exact masks of the classes alone), ``embedded``, ``coco``, ``selfie`` (MediaPipe's small
     network of people indoors), ``onnx:PATH``, ``tflite:PATH`` (probability maps), ``recorded:DIR``,
     ``weights:PATH`` (a Mask R-CNN checkpoint:

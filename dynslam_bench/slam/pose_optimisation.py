@@ -40,7 +40,7 @@ MEDIAN_CHI2 = 1.386
 """Median of chi-square with two degrees of freedom."""
 LEAST_VARIANCE = 0.01
 """The residuals' variance is at least this share of the assumed one."""
-COVARIANCE_FACTOR = 1.0
+COVARIANCE_FACTOR = 1.57
 """Calibrated factor on the covariance of a pose: residuals do not show all errors of the map that it is fitted to."""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane are never inliers."""

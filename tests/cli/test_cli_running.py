@@ -142,16 +142,16 @@ def fetched(tmp_path, monkeypatch):
 def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetched, monkeypatch):
     command = ("run", "mask-rcnn", walk, "--frames", "0:2")
     code, out, err = cli(*command)
-    assert code == 1, "an error and four cures"
-    assert not out, "an error and four cures"
-    assert not fetched.exists(), "an error and four cures"
-    assert len(err.splitlines()) == 5, "an error and four cures"
+    assert code == 1, "an error and five cures"
+    assert not out, "an error and five cures"
+    assert not fetched.exists(), "an error and five cures"
+    assert len(err.splitlines()) == 6, "an error and five cures"
     monkeypatch.setattr(running, "is_interactive", lambda: True)
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
     code, _, err = cli(*command)
     assert code == 1
-    assert "0.25 MB" in err
-    assert "Apache-2.0" in err
+    assert "170 MB" in err
+    assert "BSD-3-Clause" in err
     assert not fetched.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
     assert cli(*command)[0] == 0

@@ -443,7 +443,7 @@ def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("oracle", r"has no exact masks"),
         (
             "auto",
-            r"^(?!.*segmentation\.source=none)no masks for .*0\.25 MB, Apache-2\.0.*170 MB, BSD-3-Clause"
+            r"^(?!.*segmentation\.source=none)no masks for .*COCO checkpoint \(170 MB\).*0\.25 MB, Apache-2\.0"
             r".*onnx:PATH.*masks=none",
         ),
         ("plugin:mine", r"unknown segmenter 'mine'"),

@@ -249,12 +249,14 @@ def test_auto(monkeypatch, tmp_path):
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
     auto = SegmentationSettings()
     assert resolve_source(auto, "synthetic/walking_xyz?scene=3&frames=60", Masks()) == "embedded"
-    with pytest.raises(NetworkNotFetched, match=r"'bonn/crowd'.*0\.25 MB, Apache-2\.0") as caught:
-        resolve_source(auto, "bonn/crowd")
-    assert any("170 MB, BSD-3-Clause" in option for option in caught.value.options)
+    # the small network is offered with its licence, and never taken unasked
     (tmp_path / checkpoints.SELFIE.file).write_bytes(b"small")
-    assert resolve_source(auto, "bonn/crowd") == "selfie"
-    assert weights_digest(auto, "bonn/crowd") == hashlib.sha256(b"small").hexdigest()[:12]
+    with pytest.raises(NetworkNotFetched, match=r"'bonn/crowd'.*170 MB") as caught:
+        resolve_source(auto, "bonn/crowd")
+    assert any("0.25 MB, Apache-2.0" in option for option in caught.value.options)
+    assert any("BSD-3-Clause" in option for option in caught.value.options)
+    small = SegmentationSettings(source="selfie")
+    assert weights_digest(small, "bonn/crowd") == hashlib.sha256(b"small").hexdigest()[:12]
     (tmp_path / checkpoints.COCO.file).write_bytes(b"weights")
     assert resolve_source(auto, "bonn/crowd") == "coco"
     assert weights_digest(auto, "bonn/crowd") == hashlib.sha256(b"weights").hexdigest()[:12]
