@@ -256,7 +256,7 @@ def _validate(matrices: Array, given: int) -> tuple[NDArray[np.bool_], list[str]
         matrices: The covariances.
         given: How many of them hold a number.
     """
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], matrices, np.eye(6))
     diagonal = np.diagonal(safe, axis1=1, axis2=2)
     with_variances = finite & (diagonal > 0).all(axis=1)
@@ -331,7 +331,9 @@ def _pairs_over_a_second(
     # motions without a covariance, counted up to each pose
     gaps = np.concatenate([[0], np.cumsum(~is_valid)])
     unbroken = gaps[pairs[:, 1]] == gaps[pairs[:, 0]]
-    return pairs[near & unbroken & has_truth[pairs].all(axis=1) & (pairs[:, 1] > pairs[:, 0])]
+    usable = near & unbroken & has_truth[pairs].all(axis=1) & (pairs[:, 1] > pairs[:, 0])
+    chosen: NDArray[np.intp] = pairs[usable]
+    return chosen
 
 
 def _compose(poses: Array, matrices: Array, pairs: NDArray[np.intp]) -> Array:

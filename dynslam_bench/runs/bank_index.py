@@ -106,11 +106,13 @@ def _page(store: Bank, rows: Sequence[BankRow]) -> str:
         ("protocol", "digest", "meaning"), [(protocol.id, protocol.digest(), protocol.describe())]
     )
     lines += ["## Sequences", ""]
-    columns = ("sequence", "rows", "trackers", "split", "licence", "cite")
-    lines += _table(columns, _sequence_rows(records))
+    lines += _table(
+        ("sequence", "rows", "trackers", "split", "licence", "cite"), _sequence_rows(records)
+    )
     lines += ["## Trackers", ""]
-    columns = ("tracker", "id", "rows", "provenance", "licence", "cite")
-    lines += _table(columns, _tracker_rows(records))
+    lines += _table(
+        ("tracker", "id", "rows", "provenance", "licence", "cite"), _tracker_rows(records)
+    )
     lines += ["## Rows", ""]
     columns = ("sequence", "tracker", "repeat", "status", "ATE (mm)", "coverage", "row", "standing")
     cells = [
@@ -141,7 +143,7 @@ def _sequence_rows(records: Iterable[RunRecord]) -> list[tuple[str, ...]]:
     of_sequence: dict[str, list[RunRecord]] = {}
     for record in records:
         of_sequence.setdefault(record.sequence.id, []).append(record)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, runs in sorted(of_sequence.items()):
         first = runs[0].sequence
         trackers = sorted({run.tracker.label for run in runs})
@@ -156,7 +158,7 @@ def _tracker_rows(records: Iterable[RunRecord]) -> list[tuple[str, ...]]:
     of_tracker: dict[str, list[RunRecord]] = {}
     for record in records:
         of_tracker.setdefault(record.tracker.label, []).append(record)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, runs in sorted(of_tracker.items()):
         first = runs[0].tracker
         rows.append(

@@ -52,9 +52,8 @@ def test_the_covariance_is_that_of_simulated_poses(noise_px):
         measured = uv + rng.normal(0, noise_px, uv.shape)
         # the right coordinate has a noise of its own
         measured_right = right + rng.normal(0, noise_px, 150)
-        estimate = optimise_pose(
-            T_cam_world, points, Measurements(measured, measured_right, ones, ones), CAMERA
-        )
+        measurements = Measurements(measured, measured_right, ones, ones)
+        estimate = optimise_pose(T_cam_world, points, measurements, CAMERA)
         errors.append(se3.log(estimate.T_cam_world @ T_world_cam))
         covariances.append(motion_covariance(estimate) / COVARIANCE_FACTOR)
     errors = np.array(errors)
