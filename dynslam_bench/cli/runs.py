@@ -13,7 +13,7 @@ from dataclasses import asdict
 from itertools import pairwise, product
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 import typer
 
@@ -287,7 +287,7 @@ def archive(
     """Write a tracker's runs as an archive for the server of ETH3D or KITTI."""
     from dynslam_bench.runs.exchange.server_archives import write_server_archive
 
-    which = "online" if online else None
+    which: Literal["online"] | None = "online" if online else None
     written = write_server_archive(server, output, tracker, results=results, which=which)
     lines = [f"{name}: run {run_id}" for name, run_id in sorted(written.runs.items())]
     present(written, *lines, str(written.file))
