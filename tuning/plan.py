@@ -383,7 +383,7 @@ class StudyPlan:
         return math.sqrt(2 * squares / degrees_of_freedom)
 
     def _unused(self, records: list[RunRecord]) -> dict[str, str]:
-        """Settings of parts that dropped no feature on any frame of the baseline's runs."""
+        """Names of settings without effect in the baseline's runs, with the reason: their part dropped no feature."""
         if not records or self.baseline.tracker != self.spec.tracker or len(self.trackers) > 1:
             return {}
         # the most features that each filter dropped on any frame, by the filter's name
@@ -397,7 +397,7 @@ class StudyPlan:
         if all(record.epipolar_skipped == 1 for record in records):
             idle["epipolar"] = "F was skipped on all frames"
         if "semantic" in idle:
-            idle["segmentation"] = "there were no masks on any frame"
+            idle["segmentation"] = "masks held no feature on any frame"
         flow_filters = FLOW_FILTERS & set(most.index)
         if flow_filters and flow_filters <= idle.keys():
             idle["flow"] = f"no verdict of {' and '.join(sorted(flow_filters))} on it was used"

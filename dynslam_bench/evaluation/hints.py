@@ -734,14 +734,17 @@ CONVENTIONS = (
 """The likeliest first."""
 
 
-def _correlation(first: Array, second: Array) -> float:
-    """Correlation of vectors ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
-    length = np.linalg.norm(first, axis=1)
+def _correlation(estimated: Array, true: Array) -> float:
+    """Correlation of motions ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
+    # an estimate jumps where a tracker relocalises or closes a loop; the truth does not
+    length = np.linalg.norm(estimated, axis=1)
     usual = length <= 6 * np.median(length)
-    first = first[usual] - first[usual].mean(axis=0)
-    second = second[usual] - second[usual].mean(axis=0)
-    first_size = np.linalg.norm(first)
-    second_size = np.linalg.norm(second)
-    if first_size <= 0.1 * np.linalg.norm(length[usual]) or not second_size > 0:
+    estimated_about_mean = estimated[usual] - estimated[usual].mean(axis=0)
+    true_about_mean = true[usual] - true[usual].mean(axis=0)
+
+    # a motion that is nearly the same at every step says nothing of the convention
+    estimated_size = np.linalg.norm(estimated_about_mean)
+    true_size = np.linalg.norm(true_about_mean)
+    if estimated_size <= 0.1 * np.linalg.norm(length[usual]) or not true_size > 0:
         return 0.0
-    return float((first * second).sum() / (first_size * second_size))
+    return float((estimated_about_mean * true_about_mean).sum() / (estimated_size * true_size))

@@ -166,7 +166,7 @@ class OrbExtractor:
         # corners as flat indices of the image
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
-        # the grid begins where the first corner may lie
+        # the grid begins at ORB-SLAM's border, FAST's radius of three pixels before the first corner
         cell = self.settings.cell_px
         origin = EDGE - 3
         # cells a row, rounded up

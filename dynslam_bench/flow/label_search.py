@@ -364,21 +364,21 @@ def run_phase(
         stream = np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1)
         random = scrambled(np.uint64(seed) + _GOLDEN * stream)
         used = state.used[i]
-        placed = 0
+        n_placed = 0
         stage = CANDIDATES
         window = np.float32(0.5)
         # costs are computed in one place; the stages differ in the labels that are tried
         while True:
-            # choose `count` labels to try
+            # choose `count` labels to try: each stage writes them into `trials`
             count = population
             if stage == CANDIDATES:
                 count = finite_labels(candidates[i], trials)
                 if phase == 0 and rules.moth_flame:
-                    placed = min(count, population, end - used)
-                    copy_labels(trials, moths, placed)
+                    n_placed = min(count, population, end - used)
+                    copy_labels(trials, moths, n_placed)
             elif stage == INITIAL:
-                random = place_moths(moths, placed, lower, upper, trials, random)
-                count = population - placed
+                random = place_moths(moths, n_placed, lower, upper, trials, random)
+                count = population - n_placed
             elif stage == OPPOSITES:
                 random = opposite_labels(moths, lower, upper, low, high, trials, random)
             elif used >= end:
@@ -412,7 +412,8 @@ def run_phase(
             elif stage == INITIAL:
                 stage = OPPOSITES if opposition else SEARCH
             elif stage == OPPOSITES:
-                # the best N of X and its opposites
+                # the moths become the best N of the population and its opposites; flames that lie
+                # outside of the image have the cost `ceiling`, and leave their moth where it is
                 for m in range(population):
                     if costs[m] < ceiling:
                         for j in range(4):

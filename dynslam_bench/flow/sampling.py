@@ -69,14 +69,15 @@ def store_offsets(
     `stride` is the number of pixels a row of the image, int32.
     """
 
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        offsets, *grid, stride = arguments
-        x, y = _grid_places(context, builder, kind.args, grid)
+    def generate(context: Code, builder: Code, signature: Code, arguments: Code) -> Code:
+        offsets, columns, rows, at, *origin_and_steps, stride = arguments
+        grid = [columns, rows, at, *origin_and_steps]
+        x, y = _grid_places(context, builder, signature.args, grid)
         # whole pixels of 65536ths
         column = builder.ashr(x, constant(INTS, 16))
         row = builder.ashr(y, constant(INTS, 16))
         offset = builder.add(builder.mul(row, splat(builder, INTS, stride)), column)
-        pointer = pointer_to(context, builder, kind.args[0], offsets, grid[2], INTS)
+        pointer = pointer_to(context, builder, signature.args[0], offsets, at, INTS)
         builder.store(offset, pointer, align=4)
         return context.get_dummy_value()
 

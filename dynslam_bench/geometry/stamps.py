@@ -141,7 +141,10 @@ def associate(
 
 @lru_cache(maxsize=512)
 def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tuple[Index, Index]:
-    """`associate`, once for equal stamps: all runs on one sequence are compared with the same truth."""
+    """`associate`, once for equal stamps: all runs on one sequence are compared with the same truth.
+
+    Stamps are the bytes of float64 seconds, which can be remembered.
+    """
     # both lists in order of time, and where each stamp stood
     a, order_a = _sorted_stamps(np.frombuffer(first))
     b, order_b = _sorted_stamps(np.frombuffer(second))
@@ -149,6 +152,7 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
         raise TrajectoryError(
             f"the largest time difference is {max_dt!r}, not a number of seconds >= 0"
         )
+    # all pairs that are close enough, in order of the first stamp and then of the second
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
     pairs = np.stack([candidate_a, candidate_b], axis=1)
     # Where a stamp has several candidates, the closest pairs are taken first.

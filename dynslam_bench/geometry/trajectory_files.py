@@ -156,7 +156,7 @@ def load_tum(path: str | Path) -> LoadedTrajectory:
     texts = [table.texts[row] for row in np.flatnonzero(valid)]
     moved = (np.diff(kept[:, 1:], axis=0) != 0).any(axis=1)
     ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
-    line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
+    line_of = dict(zip(ns.tolist(), np.array(table.line_numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
 
     # poses, sorted by their stamps
@@ -381,12 +381,12 @@ class _Table:
 
     Attributes:
         values: ``[N, K]``.
-        numbers: Numbers of its lines ``[N]``.
+        line_numbers: Number of each row's line in the file ``[N]``, from 1.
         texts: Its stamps as they are written ``[N]``.
     """
 
     values: NDArray[np.float64]
-    numbers: list[int]
+    line_numbers: list[int]
     texts: list[str]
 
 
@@ -400,12 +400,12 @@ def _read_table(
             numbers.
     """
     values = array("d")
-    numbers = list[int]()
+    line_numbers = list[int]()
     texts = list[str]()
     for number, parts in _lines(path):
         if number == without:
             continue
-        numbers.append(number)
+        line_numbers.append(number)
         if len(parts) != columns:
             raise TrajectoryError(
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'",
@@ -422,7 +422,8 @@ def _read_table(
             ) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
-    return _Table(np.frombuffer(values, dtype=np.float64).reshape(-1, columns), numbers, texts)
+    table = np.frombuffer(values, dtype=np.float64).reshape(-1, columns)
+    return _Table(table, line_numbers, texts)
 
 
 def is_number(text: str) -> bool:

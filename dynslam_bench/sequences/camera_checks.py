@@ -225,7 +225,7 @@ def _position_axes(
 
         # the motions with the positions turned back
         how = "mirrored" if mirrored else f"turned by {angle:.0f} degrees"
-        shares = {"then": 100 * alike, "now": 100 * stated.translation}
+        shares = {"percent_cured": 100 * alike, "percent_stored": 100 * stated.translation}
         turned = relative.copy()
         turned[:, :3, 3] = np.einsum("nij,nj->ni", R_back, true @ W)
         return finding_of("truth-axes/positions", angle, how=how, where=where, **shares), turned

@@ -35,7 +35,9 @@ RESAVE = (
     "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
 )
 """The cure of a truth that is not in TUM's format."""
-_SO = "so they explain {then:.0f} % of the images' motion, as stored {now:.0f} %"
+_SO = (
+    "so they explain {percent_cured:.0f} % of the images' motion, as stored {percent_stored:.0f} %"
+)
 """Words on the shares of the motion that the truth explains after the cure, and before."""
 _FINDINGS: dict[str, tuple[str, str, str]] = {
     # Files that cannot be read, and recordings that are too short.
@@ -185,12 +187,14 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
     ),
     "truth-time-shift/late": (
         "s",
-        "the truth is {s:.3f} s late: so it explains {then:.0f} % of the images' motion, as stored {now:.0f} %",
+        "the truth is {s:.3f} s late: so it explains {percent_cured:.0f} % of the images' motion, "
+        "as stored {percent_stored:.0f} %",
         "subtract {s:.3f} s from the stamps of the truth",
     ),
     "truth-time-shift/early": (
         "s",
-        "the truth is {s:.3f} s early: so it explains {then:.0f} % of the images' motion, as stored {now:.0f} %",
+        "the truth is {s:.3f} s early: so it explains {percent_cured:.0f} % of the images' motion, "
+        "as stored {percent_stored:.0f} %",
         "add {s:.3f} s to the stamps of the truth",
     ),
     "truth-unclear": (
@@ -207,8 +211,8 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
     ),
     "truth-axes": (
         "degrees",
-        "the truth's axes are turned by {value:.0f} degrees against the camera's: so they explain {then:.0f} % of the "
-        "images' rotation, as stored {now:.0f} %",
+        "the truth's axes are turned by {value:.0f} degrees against the camera's: so they explain "
+        "{percent_cured:.0f} % of the images' rotation, as stored {percent_stored:.0f} %",
         "multiply each rotation of groundtruth.txt from the right by [{matrix}]",
     ),
     "truth-markers": (
@@ -224,8 +228,8 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
     ),
     "truth-axes/positions": (
         "degrees",
-        "the truth's positions are {how} in the {where}'s axes against its orientations: so they explain {then:.0f} % "
-        "of the images' translation, as stored {now:.0f} %",
+        "the truth's positions are {how} in the {where}'s axes against its orientations: so they explain "
+        "{percent_cured:.0f} % of the images' translation, as stored {percent_stored:.0f} %",
         "use one right-handed frame for both",
     ),
     # Lengths: unit of the truth, lever arm, depth factor.

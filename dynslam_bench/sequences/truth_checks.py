@@ -302,7 +302,8 @@ def _misread_findings(search: _Search) -> list[Finding]:
         for offset in np.arange(-5, 6) * _FINE_STEP_S
     ]
     shift = max(fine, key=_total).shift_s
-    shares = {"then": 100 * best.clearest, "now": 100 * search.stated.clearest}
+    # how much of the images' motion the truth explains: in the best convention, and as it is stored
+    shares = {"percent_cured": 100 * best.clearest, "percent_stored": 100 * search.stated.clearest}
 
     # both may be found
     findings = []
@@ -334,8 +335,8 @@ def _axes_finding(X: Array, alike: float, stated: Match) -> Finding:
     return finding_of(
         "truth-axes",
         angle_degrees(X),
-        then=100 * alike,
-        now=100 * stated.rotation,
+        percent_cured=100 * alike,
+        percent_stored=100 * stated.rotation,
         matrix=axes_text(X),
     )
 

@@ -59,7 +59,7 @@ def cell_error_m(cell: TrackerOnSequence) -> float | None:
 
 
 def typical_error(board: Board, key: str, names: Sequence[str]) -> TypicalError:
-    """The typical error of a tracker on some sequences of a board."""
+    """The typical error of a tracker with its settings (`RunRow.variant_key`) on some sequences of a board."""
     errors_m = []
     lost = 0
     for name in names:

@@ -213,7 +213,7 @@ class Collector:
         self._loaded = {name.partition(".")[0] for name in sys.modules}
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
         self._below: dict[str, list[str]] = {}
-        self._commands: dict[Command, set[str]] = {}
+        self._files_by_command: dict[Command, set[str]] = {}
         self._variables: dict[Command, set[str]] = {}
 
     def collect(self, modules: Modules) -> Reads:
@@ -463,9 +463,9 @@ class Collector:
         """The files and folders that programs are made of, and the distributions of this environment that they use."""
         files = set(self.programs.files)
         for command in {**self.notes.commands, **dict.fromkeys(self.programs.commands)}:
-            if command not in self._commands:
-                self._commands[command] = self._files_of(command)
-            files |= self._commands[command]
+            if command not in self._files_by_command:
+                self._files_by_command[command] = self._files_of(command)
+            files |= self._files_by_command[command]
         inputs: set[str] = set()
         distributions: set[str] = set()
         for file in files:
@@ -490,12 +490,12 @@ class Collector:
     def _variables_of(self, command: Command) -> set[str]:
         """The environment variables whose names are written in a command or in its files.
 
-        Those that are not set count, too, but in binary files: there thousands of words look like a
-        variable's name.
+        Those that are not set count, too, except in binary files: there thousands of words look like
+        a variable's name.
         """
         if command not in self._variables:
             names = set(_VARIABLE.findall(" ".join(command.words)))
-            for file in filter(os.path.isfile, self._commands[command]):
+            for file in filter(os.path.isfile, self._files_by_command[command]):
                 content = Path(file).read_bytes()
                 if b"\0" in content:
                     names |= {name for name in self.environment if os.fsencode(name) in content}

@@ -163,7 +163,7 @@ class BatchTracker:
         return work
 
     def _filled(self, folder: Path, output: Path) -> FilledProgram:
-        """The program's command and files, with the settings and the paths of what is written for it here."""
+        """Write the lists of images and ``camera.yaml``; fill the command with their paths and the settings."""
         sequence = folder / "sequence"
         camera = folder / "camera.yaml"
         self._write_lists(sequence)
