@@ -13,7 +13,7 @@ from dataclasses import asdict
 from itertools import pairwise, product
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
 
 import typer
 

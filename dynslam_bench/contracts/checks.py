@@ -163,7 +163,9 @@ def _covariance_blemishes(value: object) -> Iterator[Fault]:
     expected = "expected a 6x6 covariance of (translation in m, rotation in rad)"
     matrix = as_covariance(value)
     if not np.isfinite(matrix).all():
-        yield Fault(f"a motion covariance of shape {np.asarray(value).shape}, or not finite", expected)
+        yield Fault(
+            f"a motion covariance of shape {np.asarray(value).shape}, or not finite", expected
+        )
     elif not np.allclose(matrix, matrix.T):
         off = float(np.abs(matrix - matrix.T).max())
         yield Fault(f"a motion covariance that is not symmetric, by {off:.2g}", expected)

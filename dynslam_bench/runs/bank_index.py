@@ -106,15 +106,14 @@ def _page(store: Bank, rows: Sequence[BankRow]) -> str:
         ("protocol", "digest", "meaning"), [(protocol.id, protocol.digest(), protocol.describe())]
     )
     lines += ["## Sequences", ""]
-    lines += _table(
-        ("sequence", "rows", "trackers", "split", "licence", "cite"), _sequence_rows(records)
-    )
+    headings = ["sequence", "rows", "trackers", "split", "licence", "cite"]
+    lines += _table(headings, _sequence_rows(records))
     lines += ["## Trackers", ""]
-    lines += _table(
-        ("tracker", "id", "rows", "provenance", "licence", "cite"), _tracker_rows(records)
-    )
+    headings = ["tracker", "id", "rows", "provenance", "licence", "cite"]
+    lines += _table(headings, _tracker_rows(records))
     lines += ["## Rows", ""]
-    columns = ("sequence", "tracker", "repeat", "status", "ATE (mm)", "coverage", "row", "standing")
+    headings = ["sequence", "tracker", "repeat", "status", "ATE (mm)"]
+    headings += ["coverage", "row", "standing"]
     cells = [
         (
             row.sequence,
@@ -128,7 +127,7 @@ def _page(store: Bank, rows: Sequence[BankRow]) -> str:
         )
         for row in rows
     ]
-    lines += _table(columns, cells)
+    lines += _table(headings, cells)
     marked = [row for row in rows if row.marks]
     if marked:
         lines += ["## Marks", ""]
@@ -167,9 +166,10 @@ def _tracker_rows(records: Iterable[RunRecord]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """A table of Markdown, with an empty line after it."""
-    lines = [f"| {' | '.join(columns)} |", f"| {' | '.join('---' for _ in columns)} |"]
+    headings = list(columns)
+    lines = [f"| {' | '.join(headings)} |", f"| {' | '.join('---' for _ in headings)} |"]
     for row in rows:
         cells = [" ".join(cell.split()).replace("|", "\\|") for cell in row]
         lines.append(f"| {' | '.join(cells)} |")

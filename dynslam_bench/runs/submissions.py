@@ -96,12 +96,14 @@ def _faults_of_row(store: Bank, record: RunRecord, description: BankDescription)
         yield "its id does not tell content, code, weights and libraries"
     if record.kind == "run" and not record.sequence.content:
         yield "it does not say what its sequence held"
-    # a run that failed is a row, too; one that came to its end has an error
+    # a run that failed or was lost is a row, too; any other has an error
     if record.failed:
         return
-    error = _error_of(store, record, description)
-    if error is None:
-        yield f"it has no error under {description.protocol}"
+    metrics = store.score(record, description.protocol, again=True)
+    error = metrics.metrics.get("ate_rmse_m")
+    if error is None and record.status == "ok":
+        reason = metrics.reasons.get(metrics.trajectory, "no reason")
+        yield f"it has no error under {description.protocol}: {reason}"
     marks, _ = read_marks(store.root)
     for mark in marks.get(record.run_id, ()):
         if error is not None and abs(mark.ate_m - error) > _ERROR_TOLERANCE_M:
@@ -109,12 +111,6 @@ def _faults_of_row(store: Bank, record: RunRecord, description: BankDescription)
                 f"the mark of {mark.by} says {1000 * mark.ate_m:.3f} mm, "
                 f"the trajectory gives {1000 * error:.3f} mm"
             )
-
-
-def _error_of(store: Bank, record: RunRecord, description: BankDescription) -> float | None:
-    """The error of a row, computed from its trajectory, metres; None where it has none."""
-    metrics = store.score(record, description.protocol, again=True)
-    return metrics.metrics.get("ate_rmse_m")
 
 
 def _contradiction(store: Bank, record: RunRecord, accepted: Bank) -> str:

@@ -41,6 +41,7 @@ from dynslam_bench.geometry import Camera, load_tum, read_kitti
 from dynslam_bench.geometry.motion_covariances import read_motion_covariances
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, packing
+from dynslam_bench.runs.bank_files import DESCRIPTION_FILE, read_description
 from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.layout import INDEX_FILE
 from dynslam_bench.runs.listing import list_runs
@@ -545,6 +546,11 @@ TEXTS = [
         "checksums of a bank",
         lambda data, folder: bank.verify(at(folder, bank.SUMS, data).parent),
         lambda: [b"0" * 64 + b"  runs/x\n" + b"1" * 64 + b"  ../gone\n", b"x\n"],
+    ),
+    Target(
+        "description of a bank",
+        lambda data, folder: read_description(at(folder, DESCRIPTION_FILE, data).parent),
+        lambda: [b'{"protocol": "tum-rgbd/v1", "probes": {"synthetic/a?scene=0": "00"}}'],
     ),
     Target(
         "manifest of a bank",
