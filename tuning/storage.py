@@ -189,6 +189,7 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
 def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
     """One row of `trials_frame`, without the tuned settings; what is missing is None."""
     values = dict(zip(spec.objectives, trial.values or [], strict=False))
+    # the objective "accuracy" is the log of the ratio of ATE to the baseline's
     accuracy = values.get("accuracy")
     return {
         **{f"value_{objective}": value for objective, value in values.items()},

@@ -483,7 +483,7 @@ def check_import(location: str) -> None:
 def described(target: str) -> dict[str, Any]:
     """``id`` and ``sequences`` of a plug-in's spec, read in a process of its own; empty where it cannot be loaded.
 
-    In the process of a run, which may be changed by what it imports, the spec is loaded there.
+    A process that makes a run (`ISOLATED_VARIABLE` is set) loads the spec itself: it may be changed by it.
 
     Args:
         target: ``module:Attr`` or ``file.py:Attr``.

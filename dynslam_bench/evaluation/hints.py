@@ -616,12 +616,19 @@ def _in_axes_of_a_body(
 
 
 def _pairs(stamps: Array) -> NDArray[np.intp]:
-    """Poses ``[P, 2]`` between which motions are compared; none over holes."""
-    longest = min(PAIR_S, (stamps[-1] - stamps[0]) / 3)
-    ends = np.searchsorted(stamps, stamps + longest)
+    """Indices ``[P, 2]`` of the poses between which motions are compared; none over holes.
+
+    Args:
+        stamps: Of the poses ``[N]``, seconds, ascending.
+    """
+    # each pose, and the first one that is at least so much later
+    apart_s = min(PAIR_S, (stamps[-1] - stamps[0]) / 3)
+    ends = np.searchsorted(stamps, stamps + apart_s)
     starts = np.flatnonzero(ends < len(stamps))
     pairs = np.stack([starts, ends[starts]], axis=1)
-    pairs = pairs[stamps[pairs[:, 1]] - stamps[pairs[:, 0]] < 2 * longest]
+
+    # a pair that is twice as long goes over a hole; some 300 pairs are enough
+    pairs = pairs[stamps[pairs[:, 1]] - stamps[pairs[:, 0]] < 2 * apart_s]
     return np.asarray(pairs[:: 1 + len(pairs) // 300])
 
 

@@ -669,19 +669,21 @@ def _two_sided(centre: float, error: float, free: float) -> float:
     return float(2.0 * special.stdtr(free, -abs(centre) / max(error, _SMALLEST_ERROR)))
 
 
-def resolution_floor(error: float, free: float, trackers: int, level: float) -> float:
+def resolution_floor(error: float, degrees_of_freedom: float, trackers: int, level: float) -> float:
     """Smallest gain, as a share, that a board of so many trackers shows in four of five; 1 where it shows none.
 
     Args:
         error: Standard error of the log ratio.
-        free: Its degrees of freedom.
+        degrees_of_freedom: Those of the standard error.
         trackers: How many are compared with the reference (Bonferroni, Holm's first step).
         level: Chance of any false claim.
     """
-    if free < 1 or not math.isfinite(error):
+    if degrees_of_freedom < 1 or not math.isfinite(error):
         return 1.0
-    quantiles = stats.t.isf(level / (2 * trackers), free) + stats.t.ppf(POWER, free)
-    return float(-math.expm1(-quantiles * error))
+    # the smallest log gain is (t of the level + t of the power) standard errors; as a share of the error
+    t_of_level = stats.t.isf(level / (2 * trackers), degrees_of_freedom)
+    t_of_power = stats.t.ppf(POWER, degrees_of_freedom)
+    return float(-math.expm1(-(t_of_level + t_of_power) * error))
 
 
 def may_be_best(

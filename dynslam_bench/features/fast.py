@@ -74,6 +74,7 @@ def fast_corners(
     height, width = image.shape
     circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
     maxima = np.zeros(image.size, np.uint8)
+    # of 2 x 2 pixels one at most is stronger than its neighbours
     corners = np.empty(image.size // 4, np.int64)
     count = list_corners(image.reshape(-1), height, width, threshold, circle, maxima, corners)
     corners = corners[:count]

@@ -387,7 +387,7 @@ def rotation_consistent(
     """
     # histogram of the differences of orientation
     difference = np.mod(np.asarray(angle_a, np.float64) - np.asarray(angle_b, np.float64), 360.0)
-    index = np.minimum((difference * (bins / 360.0)).round().astype(np.int64) % bins, bins - 1)
+    index = (difference * (bins / 360.0)).round().astype(np.int64) % bins
     counts = np.bincount(index, minlength=bins)
     # the three fullest bins, if they hold enough matches
     top = np.argsort(-counts, kind="stable")[:3]

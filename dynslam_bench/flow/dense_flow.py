@@ -263,22 +263,24 @@ class _RegionLabels:
         self._best = np.full(reference.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
 
-        # search a label for each superpixel at its centre, and refine it
+        # search a label for each superpixel at its centre, without a guess
         centres = reference.centres
         neighbours = reference.neighbours
         target_arrays = image_arrays(pair.target, pair.tables)
         matching = MatchingCost(reference.described, target_arrays, pair.tables)
         state = search_labels(sparse.settings, sparse.workers.run, matching, neighbours, None, seed)
+        # the best label of each region [R, 4], refined in place
         labels = np.ascontiguousarray(state.flames[:, 0])
         if settings.refinement == "lucas-kanade":
             sparse.refine_together(centres, labels, neighbours, pair)
         self.evaluations = int(state.used.sum())
 
-        # every pixel takes the best of its region's label and its neighbours'
+        # every pixel takes the best of its region's label and its neighbours', [R, candidates, 4]
         near = np.ascontiguousarray(neighbours[:, : settings.candidates - 1])
-        self._choose(
-            np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1)
+        candidates = np.concatenate(
+            [labels[:, None], labels_as_seen(centres, labels, near)], axis=1
         )
+        self._choose(candidates)
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region with an inconsistent pixel, the motion of the regions around it, fitted and refined.

@@ -124,6 +124,7 @@ def map_geometry(height: int, width: int) -> MapGeometry:
         margin = MARGIN // step
         # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
         shift = int(np.log2(step * SUBPIXEL))
+        # half a pixel and the margin, in quarter pixels
         bias = SUBPIXEL // 2 + margin * step * SUBPIXEL
         levels.append((total, columns + 2 * margin, shift, bias))
         total += (rows + 2 * margin) * (columns + 2 * margin)

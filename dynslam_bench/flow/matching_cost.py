@@ -115,9 +115,10 @@ def cost_tables(
     geometry = layout.map_geometry(*shape)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
 
-    # byte offset of each histogram, for every scale, rotation, quarter of the centre's cell, histogram
     # level of each histogram, [scales, 17]
     level = np.repeat(ring_level, (9, 8), axis=1)
+
+    # byte offset of each histogram; the axes are [scale, rotation, quarter of the centre's cell, histogram, xy]
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
     quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
     centres = quarters[None, None, :, None, :]
@@ -130,9 +131,9 @@ def cost_tables(
 
     # truncated linear penalties; an image's cost is 0 where the term does not count
     difference = np.arange(256) / 255.0
-    counts = terms == 3
-    intensity = truncated_penalty(difference, *INTENSITY, counts)
-    gradient = truncated_penalty(difference, *GRADIENT, counts)
+    has_appearance = terms == 3
+    intensity = truncated_penalty(difference, *INTENSITY, has_appearance)
+    gradient = truncated_penalty(difference, *GRADIENT, has_appearance)
     truncation = round(TRUNCATION * 255)
     ceiling = support * (
         layout.HISTOGRAMS * truncation + int(intensity.max()) + int(gradient.max())
@@ -144,7 +145,7 @@ def cost_tables(
         truncation=truncation,
         intensity=intensity,
         gradient=gradient,
-        appearance=counts,
+        appearance=has_appearance,
         support=np.asarray(SUPPORT[:support], dtype=np.int64) * spacing,
         ceiling=ceiling,
     )

@@ -45,14 +45,14 @@ class _Request:
 
     Attributes:
         due: When its masks are taken, seconds of the frames' stamps.
-        since: Frames since the one that was segmented before it.
+        frames_between: Frames from the one that was segmented before to this one.
         answer: The objects, and the seconds that the segmenter took.
         flow: Dense flow from it to the latest frame, float32 ``[h, w, 2]``.
         age: Frames from it to the latest frame.
     """
 
     due: float
-    since: int
+    frames_between: int
     answer: Future[tuple[Instances, float]]
     flow: NDArray[np.float32]
     age: int = 0
@@ -166,7 +166,10 @@ class MaskScheduler:
         return self._instances
 
     def _take(self, frame: Frame, gray: NDArray[np.uint8]) -> bool:
-        """Take the masks that are due, carried to this frame, and begin with it; False if none are due."""
+        """Take the masks that are due, carried to this frame; False if none are due.
+
+        A segmenter that is idle begins with this frame, whether masks were taken or not.
+        """
         flow = dense_flow(self._gray, gray)
         request = self._request
         if request is not None:
@@ -183,7 +186,7 @@ class MaskScheduler:
             self._request = None
             instances, self.async_segmenter_s = request.answer.result()
             self._instances = carry_dense(
-                self._missed.update(instances, request.since), request.flow
+                self._missed.update(instances, request.frames_between), request.flow
             )
         else:
             self._instances = carry_dense(self._instances, flow)
@@ -193,9 +196,13 @@ class MaskScheduler:
             answer: Future[tuple[Instances, float]] = Future()
             _working.add(answer)
             Thread(target=_segment, args=(self._frozen(), frame, answer), daemon=True).start()
-            since = self._age if request is None else request.age
+            # frames from the one that was segmented before to this one
+            frames_between = self._age if request is None else request.age
             self._request = _Request(
-                frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow)
+                frame.timestamp + self._settings.latency_s,
+                frames_between,
+                answer,
+                np.zeros_like(flow),
             )
         return taken
 

@@ -325,6 +325,8 @@ def _essential(
 ) -> tuple[list[Array], NDArray[np.bool_]]:
     """The motions of the essential matrix of most matches, and which matches fit it in both images.
 
+    Motions are ``[4, 4]``, from the first camera to the second, with a translation of length 1.
+
     Args:
         xy_first: Pixels ``[N, 2]`` of the first view.
         xy_second: Pixels ``[N, 2]`` of the second view.

@@ -394,13 +394,19 @@ class LoopCloser:
         """The loop to the place in the root map where a submap's camera is, and whether the pose there counts.
 
         The loop is None where the place does not determine the merge well enough.
+
+        Args:
+            slot: The submap's newest keyframe, a row of the map's arrays of keyframes.
+            observations: Its features.
+            place: Its camera's pose in the root map, with the matches that gave it.
         """
         # a place whose keyframe was culled since counts no more, and one that fits twice neither
         loop = self._loop(slot, place)
         if loop is None or not self.map.kf_alive[place.keyframe]:
             return None, RootMapPose.REJECTED
-        matters = loop.fits or self._scale_is_known
-        if matters and self._aliased(slot, observations, loop):
+        # without a known scale a loop that does not fit is rejected below, ambiguous or not
+        ambiguity_counts = loop.fits or self._scale_is_known
+        if ambiguity_counts and self._aliased(slot, observations, loop):
             return None, RootMapPose.REJECTED
 
         # a merge needs more than a pose

@@ -1,7 +1,7 @@
-"""Robust pose optimisation against known points: Gauss-Newton on SE(3) with the right coordinate of depth.
+"""Robust pose optimisation against known points: Levenberg-Marquardt on SE(3) with the right coordinate of depth.
 
 The residual of a point is ``(u - u', v - v', ur - (u' - b f / z'))``; features without depth have
-the first two rows only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test
+the first two rows only. Rounds of a Huber-weighted Levenberg-Marquardt alternate with a chi-square test
 that sets outliers aside, as in motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos,
 2017, Section III-C). The last round weighs the inliers by Cauchy's kernel, as wide as their own
 residuals are: most features are located far more exactly than the assumed pixel, and those that are
@@ -430,7 +430,7 @@ def optimise_pose(
         measured: Where the image shows them.
         camera: Intrinsics and baseline.
         rounds: Optimisations, each followed by a new sorting into inliers and outliers.
-        iterations: Gauss-Newton steps a round at most.
+        iterations: Steps a round at most.
 
     Returns:
         The pose; with fewer than six points the start pose and no inliers.

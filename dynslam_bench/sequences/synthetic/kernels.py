@@ -250,7 +250,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
         tiles_y: Tiles in a column.
 
     Returns:
-        (start int32 ``[tiles + 1]``, list int32).
+        (start int32 ``[tiles + 1]``, members of all tiles int32 ``[start[-1]]``).
     """
     # Counting sort: lengths of the lists, their starts, then the lists.
     start = np.zeros(tiles_x * tiles_y + 1, np.int32)

@@ -591,7 +591,12 @@ def _template_text(path: Path, target: str) -> str:
 
 
 def _check_names(document: ProgramDocument[Any], places: set[str]) -> None:
-    """Refuse settings that are called like another placeholder."""
+    """Refuse settings that are called like another placeholder.
+
+    Args:
+        document: The program's file.
+        places: Names of placeholders that are no settings, such as ``camera.fx``.
+    """
     taken = {place.partition(".")[0] for place in places}
     for name in document.declared:
         if name in taken:
