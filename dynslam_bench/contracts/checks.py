@@ -158,7 +158,7 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
         )
 
 
-def _covariance_blemishes(value: object) -> Iterator[Fault]:
+def _covariance_blemishes(value: Any) -> Iterator[Fault]:
     """Faults of a motion covariance; runs state it, and score the others."""
     expected = "expected a 6x6 covariance of (translation in m, rotation in rad)"
     matrix = as_covariance(value)

@@ -146,7 +146,7 @@ def resolve_source(
         return settings.source
 
     # auto: the embedded network on what it was trained for, else the COCO checkpoint if it is there;
-    # the small network is worse than no masks on some recordings, so that the user has to name it
+    # the small network is worse than no masks on some recordings: the user has to name it
     if sequence_id.startswith("synthetic/"):
         return "embedded"
     if cached_checkpoint(COCO) is not None:

@@ -5,7 +5,7 @@
 
 The first table has a row a decay: the geometric mean over the data of the choice of `mask-rcnn`'s ATE over that without
 carrying, with its range over sequences. These are composites (instances 0, 1, ...) and walking replicas of scenes for
-tuning, people whom no recording of the report shows. The decay with the least mean is taken. The second table has the
+tuning. The decay with the least mean is taken. The second table has the
 ATE in mm of trackers by masks: none, the network alone, carried with that decay, and YOLO's; on the recordings, which
 no choice has seen, from each start, on the people's recording, and on a further composite a host. ATE is that of the
 online poses of tracked frames under tum-rgbd/v1; a share of tracked frames below 100 % stands beside it.

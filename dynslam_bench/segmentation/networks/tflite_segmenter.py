@@ -177,8 +177,7 @@ class TfliteSegmenter:
                 f"{self.path}: the output {self._output} holds values from {low:.4g} to {high:.4g}, a probability lies "
                 "between 0 and 1"
             )
-        maps: NDArray[np.float32] = output[0]
-        return maps
+        return np.asarray(output[0])
 
     def _name_maps(self, header: TfliteHeader) -> tuple[str, ...]:
         """The class of each map; a file without labels has the usual ones, with a warning."""
