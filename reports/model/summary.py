@@ -85,7 +85,9 @@ def _better_words(board: Board, ranked: list[Standing]) -> str:
     endings = []
     if board.ranked_sequences.can_go_beyond:
         if best != named:
-            endings.append(f"{_names(board, best)} may be the best")
+            # a claim on these families says nothing of others, where the reference may be as good
+            where = "" if beyond else "beyond them "
+            endings.append(f"{where}{_names(board, best)} may be the best")
         elif len(best) > 1:
             endings.append("each of them may be the best")
         else:
