@@ -7,7 +7,7 @@ function pairsOf(board, a, b) {
   const of = (tracker) => new Map(board.cells.filter((cell) => cell[0] === tracker && cell[5][0] !== null).map((cell) => [cell[1], cell]));
   const [one, other] = [of(a), of(b)];
   return [...one.keys()].filter((sequence) => other.has(sequence)).map((sequence) => {
-    const cells = [one.get(sequence), other.get(sequence)], [x, y] = cells.map((cell) => Math.max(cell[5][0], 1e-6));
+    const cells = [one.get(sequence), other.get(sequence)], [x, y] = cells.map((cell) => Math.max(cell[5][0], 1e-4));
     return { sequence, cells, change: Math.log(y / x) };
   }).sort((p, q) => Math.abs(q.change) - Math.abs(p.change));
 }
@@ -16,12 +16,16 @@ function pairsOf(board, a, b) {
 function sentenceOf(ratios, a, b, names) {
   const entry = ratios.find(([one, other]) => (one === a && other === b) || (one === b && other === a));
   if (!entry) return `${names[1]} and ${names[0]} have no ranked sequence in common.`;
-  const turned = entry[0] === b, [, , value, from, to, n, verdict] = entry;
+  const turned = entry[0] === b, [, , value, from, to, n, verdict, scope, words] = entry;
+  if (words) return words;
   const [ratio, low, high] = turned ? [1 / value, 1 / to, 1 / from] : [value, from, to], count = `${n} sequence${n > 1 ? "s" : ""}`;
   if (Math.abs(ratio - 1) < 1e-6) return `${names[1]} and ${names[0]} have the same error on ${count}.`;
   const head = `${names[1]} against ${names[0]}: ${percentText(ratio)} on ${count}`;
   if (from === null) return `${head}, too few scenes to tell.`;
   const range = `ratio ${ratio.toFixed(3)}, 95 % interval ${low.toFixed(3)} to ${high.toFixed(3)}`, apart = low > 1 || high < 1;
+  if (verdict.includes("lost")) return `${head}; where both succeed ${names[+(verdict.startsWith("better") !== turned)]} is better ${scope}, but it lost more sequences (${range}).`;
+  if (scope === "by lost sequences") return `${head} where both succeed; ${names[+(verdict.startsWith("better") === turned)]} lost more sequences than chance explains (${range}).`;
+  if (!apart && verdict !== "cannot tell" && scope === "on these families") return `${head}, shown ${scope}; the interval goes beyond them (${range}).`;
   if (verdict === "cannot tell" && apart) return `${head}, but among all pairs of the board one may differ so by chance (${range}).`;
   return apart ? `${head} (${range}).` : `${head}, but that may be chance (${range}).`;
 }

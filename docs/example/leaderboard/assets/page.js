@@ -40,6 +40,9 @@ async function draw(element, figure) {
   if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: 1.02, yanchor: "bottom", ...layout.legend };
   const options = { format: "png", scale: 2, filename: element.id };
   await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });
+  // points that stand for a run open it
+  element.removeAllListeners("plotly_click");
+  element.on("plotly_click", ({ points: [point] }) => { if (String(point?.customdata).startsWith("run.html#")) location.href = point.customdata; });
 }
 
 /** The figures of the page, each when it comes into sight. */
@@ -79,6 +82,9 @@ function sortable(table, options = {}) {
   return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
+for (const button of select("[data-copy]")) {
+  button.onclick = () => navigator.clipboard.writeText(button.nextElementSibling.textContent).then(() => { button.textContent = "Copied"; });
+}
 dark.addEventListener("change", followTheme);
 followTheme();
 const sorts = (table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {});
@@ -87,4 +93,24 @@ for (const table of select("table.sorts")) { // those of closed folds once they 
   fold ? fold.addEventListener("toggle", () => sorts(table), { once: true }) : sorts(table);
 }
 addEventListener("DOMContentLoaded", drawFigures);
-addEventListener("beforeprint", () => select("details").forEach((fold) => { fold.open = true; }));
+
+// -- paper: folds open, whole tables with all columns, figures at the width of a page
+const PAPER_PX = 980;
+const whole = []; // what puts tables back as they were
+addEventListener("beforeprint", () => {
+  select("details").forEach((fold) => { fold.open = true; });
+  for (const element of select("table.dataTable")) {
+    const table = new DataTable.Api(element), length = table.page.len(), hidden = table.columns(".sure").indexes().filter((column) => !table.column(column).visible()).toArray();
+    table.columns(hidden).visible(true);
+    if (length > 0) table.page.len(-1).draw(false);
+    whole.push(() => { table.columns(hidden).visible(false); if (length > 0) table.page.len(length).draw(false); });
+  }
+  for (const element of select(".figure")) {
+    if (FIGURES[element.id] && !drawn.has(element)) draw(element, FIGURES[element.id]);
+    if (element.layout) Plotly.relayout(element, { width: PAPER_PX, template: THEMES.light });
+  }
+});
+addEventListener("afterprint", () => {
+  whole.splice(0).forEach((restore) => restore());
+  drawn.forEach((figure, element) => element.isConnected && element.layout && draw(element, figure));
+});

@@ -47,6 +47,7 @@ const rowsOf = (heads, rows) => make("div", { className: "scroll" }, make("table
 const fold = (title, ...parts) => make("details", { className: "fold" }, make("summary", { textContent: title }), ...parts);
 
 class RunView {
+  static clock = 0; // of the run that plays
   second = null; // the run of another tracker
   constructor(run) {
     this.run = run;
@@ -64,9 +65,12 @@ class RunView {
       this.move(this.at + (event.key === "ArrowRight" ? 1 : -1));
     };
     byId("worst").replaceChildren(...(run.worst.length ? ["worst frames: "] : []), ...run.worst.map(([frame, error]) => make("button", { type: "button", textContent: `${frame} (${error} mm)`, onclick: () => this.move(nearest(this.frames, frame)) })));
-    for (const [name, there] of [["image", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
+    for (const [name, there] of [["picture", run.pictures.length], ["track", run.figures.track], ["time", run.figures.time]]) byId(name).hidden = !there;
+    byId("drawn").textContent = run.caption.join(" ");
+    byId("play").onclick = () => this.play(!this.playing);
+    this.play(false);
     const wanted = address.read().get("frame");
-    this.at = wanted ? nearest(this.frames, +wanted) : run.worst.length ? nearest(this.frames, run.worst[0][0]) : 0;
+    this.at = wanted ? nearest(this.frames, +wanted) : run.moment === null ? this.worst() : nearest(this.frames, run.moment);
     await this.drawTrack();
     if (run.figures.time) {
       const t = this.times[this.at] ?? 0;
@@ -89,13 +93,30 @@ class RunView {
     await draw(byId("track"), { data: [...figures.track.data, ...other, ...corners([...figures.track.data, ...other]), marker(this.run, this.times[this.at] ?? 0)], layout: figures.track.layout });
   }
 
+  /** Of a run of which only the track is known: the place with the largest error. */
+  worst() {
+    const errors = this.run.series.track_error ?? [];
+    return errors.reduce((worst, error, at) => (error > (errors[worst] || 0) ? at : worst), 0);
+  }
+
+  /** Go on frame by frame until the end, in about ten seconds, or stop. */
+  play(on) {
+    clearInterval(RunView.clock);
+    this.playing = on;
+    byId("play").textContent = on ? "Pause" : "Play";
+    byId("play").setAttribute("aria-pressed", on);
+    if (!on) return;
+    if (this.at >= this.times.length - 1) this.move(0);
+    const step = Math.max(1, Math.round(this.times.length / 100));
+    RunView.clock = setInterval(() => { this.move(this.at + step); if (this.at >= this.times.length - 1) this.play(false); }, 100);
+  }
+
   move(at, write = true) {
     if (!this.times.length) return;
     const { run } = this;
     this.at = Math.max(0, Math.min(this.times.length - 1, at));
     byId("frame").value = this.at;
     const t = this.times[this.at], frame = run.series.index?.[this.at], caption = document.querySelector("#picture figcaption");
-    caption.textContent = "No pictures: they are kept with --snapshots";
     if (run.pictures.length) {
       const shown = run.pictures[nearest(run.pictures, frame ?? 0)];
       Object.assign(byId("image"), { src: pictureOf(run.id, shown), alt: `Frame ${shown} as the tracker saw it` });
@@ -176,7 +197,7 @@ async function showRun(id) {
 }
 
 function startRun() {
-  const wanted = () => [...address.read().keys()].find((key) => /^[0-9a-f]{16}$/.test(key)) ?? "";
+  const wanted = () => [...address.read().keys()].find((key) => /^[0-9a-f]{16}([0-9a-f]{4})?$/.test(key)) ?? "";
   let shown = wanted();
   addEventListener("hashchange", () => { if (wanted() !== shown) showRun((shown = wanted())); });
   addEventListener("DOMContentLoaded", () => showRun(shown));
