@@ -1,4 +1,4 @@
-"""What a gate measured of one side, and the baseline file that holds it."""
+"""Measurements of one side of a gate, and the baseline file that holds them."""
 
 from __future__ import annotations
 
@@ -238,7 +238,7 @@ class Baseline(Record):
         return self
 
     def changed(self, asked: GateConfig) -> list[str]:
-        """What of the question is other than when the baseline was recorded, a line each."""
+        """Differences of the question from that of the recorded baseline, one a line."""
         before = self.asked.model_dump(mode="json")
         return _differences(before, asked.model_dump(mode="json"))
 

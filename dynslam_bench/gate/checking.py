@@ -630,7 +630,7 @@ def _recorded_side(recorded: Baseline, cases: Cases, *, confirm: bool) -> Side:
 
 
 def _notes_on_machine(machine: Machine) -> list[str]:
-    """What differs between the baseline's machine and this one."""
+    """Notes on the differences between the baseline's machine and this one."""
     here = this_machine()
     if here == machine:
         return []

@@ -28,7 +28,7 @@ Cases = dict[str, RunSpec]
 
 
 class Guardrails(Record):
-    """What must not get worse beside the error; None leaves one out.
+    """Guardrails: quantities beside the error that must not get worse; None leaves one out.
 
     Attributes:
         coverage: Share of the frames by which the mean coverage may fall.
@@ -50,7 +50,7 @@ class Guardrails(Record):
 
 
 class GateConfig(Record):
-    """What a gate runs, and what counts as a difference.
+    """The question of a gate: what it runs, and what counts as a difference.
 
     Attributes:
         trackers: Ids, ``subprocess:COMMAND``, ``batch:FILE.toml``, ``module:Attr`` or

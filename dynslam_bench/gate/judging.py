@@ -39,7 +39,7 @@ _ROUNDING = 1e-9
 
 
 class Findings(NamedTuple):
-    """What both sides show after some rounds.
+    """Findings on both sides after some rounds.
 
     Attributes:
         verdict: Verdict on the error alone.

@@ -33,7 +33,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session")
 def dynslam_gate(pytestconfig: pytest.Config) -> GateResult:
-    """What the gate finds in the working tree, beside its baseline file; whatever does not pass fails here."""
+    """Result of the gate in the working tree, beside its baseline file; whatever does not pass fails here."""
     from dynslam_bench import gate
 
     path = pytestconfig.rootpath / pytestconfig.getoption("--dynslam-gate")

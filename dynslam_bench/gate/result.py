@@ -1,4 +1,4 @@
-"""What a gate found: verdict, guardrails, every sequence; as JSON, as a summary of ten lines, as an exit code."""
+"""Result of a gate: verdict, guardrails, every sequence; as JSON, as a summary of ten lines, as an exit code."""
 
 from __future__ import annotations
 
