@@ -236,6 +236,7 @@ class Results(RoundRecord):
         round_sha256: SHA-256 of ``round.json``.
         scenes: Digest of the bits of each scene as they were rendered there, by its id.
         rows: The runs.
+        sample: Whether all rows are a sample that a verifier has drawn: then scenes may be missing.
         network: ``none`` where no entry could reach a network, else ``open``.
         made: UTC, ISO 8601.
         machine: The computer.
@@ -246,6 +247,7 @@ class Results(RoundRecord):
     round_sha256: Sha256
     scenes: dict[str, Sha256]
     rows: list[Row]
+    sample: bool = False
     network: Literal["none", "open"]
     made: str
     machine: Machine

@@ -106,6 +106,15 @@ def check_runner(opened: RoundFolder, by: str) -> None:
     """
     if not re.match(PLAIN_NAME, by):
         raise RunError(f"'{by}' is no name of a runner", "letters, digits, dots and dashes")
+    check_release(opened)
+
+
+def check_release(opened: RoundFolder) -> None:
+    """Check that a round is revealed and fits this installation.
+
+    Raises:
+        RunError: One does not hold.
+    """
     _ = opened.reveal
     opened.round.check_here()
 
@@ -147,6 +156,7 @@ def make_rows(
     jobs: int,
     on_step: Callable[[str], None],
     on_event: OnEvent | None,
+    sample: bool = False,
 ) -> RoundRuns:
     """Run entries on scenes, add the runs to the runner's bank, and describe the bank.
 
@@ -158,6 +168,7 @@ def make_rows(
         jobs: Runs at a time.
         on_step: Called with each step in words.
         on_event: Called with every `RunEvent`.
+        sample: Whether the pairs are a sample of a verifier.
 
     Raises:
         DynslamError: The round's bank cannot be written, or has faults.
@@ -194,9 +205,9 @@ def make_rows(
 
     # the bank, and which rows it holds: those of earlier calls, too
     folder = opened.bank(by)
-    results_here = _described(opened, by, digests, rows)
+    results_here = _described(opened, by, digests, rows, sample=sample)
     if rows:
-        left_out = bank.add([store.root], folder).left_out
+        left_out = bank.add([store.root], folder, protocol=opened.round.protocol).left_out
         failed += [f"left out of the bank: {entry.path}: {entry.reason}" for entry in left_out]
         write_atomic(folder / RESULTS_FILE, results_here.to_json())
     return RoundRuns(results_here, folder, rows, failed)
@@ -231,13 +242,14 @@ def _made(
 
 
 def _described(
-    opened: RoundFolder, by: str, digests: dict[str, str], rows: Sequence[Row]
+    opened: RoundFolder, by: str, digests: dict[str, str], rows: Sequence[Row], *, sample: bool
 ) -> Results:
     """The description of a runner's bank after new rows."""
     scenes: dict[str, str] = {}
     every: dict[tuple[str, str], Row] = {}
     if (opened.bank(by) / RESULTS_FILE).is_file():
         earlier = opened.read_results(by)
+        sample = sample and earlier.sample
         scenes |= earlier.scenes
         every |= {(row.entry, row.sequence): row for row in earlier.rows}
     every |= {(row.entry, row.sequence): row for row in rows}
@@ -246,6 +258,7 @@ def _described(
         round_sha256=opened.sha256,
         scenes=scenes | digests,
         rows=list(every.values()),
+        sample=sample,
         network=network(),
         made=stamp(datetime.now(timezone.utc)),
         machine=this_machine(),

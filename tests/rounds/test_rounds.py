@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -17,16 +18,21 @@ from dynslam_bench.core.fingerprint import this_machine
 from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
+from dynslam_bench.rounds.board import BoardRow
 from dynslam_bench.rounds.entering import check_is_new
 from dynslam_bench.rounds.files import (
     Program,
     RoundFolder,
+    Row,
     Trial,
     open_round,
     renderer_versions,
 )
 from dynslam_bench.rounds.programs import difference, program_of
+from dynslam_bench.rounds.rows import ScoredRow, agreement
 from dynslam_bench.rounds.running import check_runner
+from dynslam_bench.rounds.verifying import _faults_of_pairs, _other_request, checked_rows
+from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.testing.template import write_tracker_template
 
@@ -307,6 +313,111 @@ def test_an_entry_is_frozen_with_its_own_files_and_its_package() -> None:
     assert program.code["package numpy"]
 
 
+# -- results of others -----------------------------------------------------------------------------
+
+
+def results_of(
+    opened: RoundFolder, by: str, rows: list[tuple[str, str]], **changes: object
+) -> Path:
+    """Write the description of a runner's bank."""
+    values = {
+        "by": by,
+        "round_sha256": opened.sha256,
+        "scenes": {},
+        "rows": [
+            {"entry": entry, "sequence": sequence, "run_id": "0" * 20} for entry, sequence in rows
+        ],
+        "network": "none",
+        "made": "2026-11-29T12:00:00+00:00",
+        "machine": this_machine(),
+        "versions": {},
+    }
+    file = opened.bank(by) / "results.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(rounds.Results.model_validate(values | changes).to_json())
+    return file
+
+
+def revealed(root: Path, *names: str) -> RoundFolder:
+    """A round with entries that is revealed."""
+    opened = written(root)
+    for name in names:
+        entered(opened, name)
+    rounds.reveal(root, f"{root}.salt")
+    return open_round(root)
+
+
+def test_each_entry_has_each_scene_once_but_in_a_sample(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    first, *others = opened.sequences
+    rows = [("still", first), ("still", first), ("still", others[0])]
+    results_of(opened, "alice", rows)
+    faults = _faults_of_pairs(opened, opened.read_results("alice"))
+    assert faults == [
+        "still on walking_xyz 0 has 2 rows",
+        "still lacks 2 of 4 scenes: crowd_xyz 0, crowd_xyz 1",
+    ]
+    results_of(opened, "bob", rows[1:], sample=True)
+    assert _faults_of_pairs(opened, opened.read_results("bob")) == []
+
+
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[]"])
+def test_damaged_results_of_one_runner_are_a_fault_of_that_runner(
+    content: bytes, tmp_path: Path
+) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    file = results_of(opened, "alice", [])
+    file.write_bytes(content)
+    rows, faults = checked_rows(opened, "alice", render=False)
+    assert rows == []
+    (fault,) = faults
+    assert fault.startswith("alice: ")
+    # one who calls himself otherwise than his folder
+    shutil.copyfile(results_of(opened, "bob", []), file)
+    assert "names 'bob' as its runner" in checked_rows(opened, "alice", render=False)[1][0]
+    with pytest.raises(DynslamError, match="no row of round 2026a can be scored"):
+        rounds.report(opened.root)
+
+
+def test_a_run_must_be_what_the_round_asks_for() -> None:
+    asked = {"tracker": "never-move", "seed": 0, "stride": 1, "device": "cpu", "degrade": {}}
+    identity = asked | {"device": "cuda:0"}
+
+    def fault(kind: str = "run", **changes: object) -> str:
+        record = RunRecord.model_construct(kind=kind, identity=identity | changes)
+        return _other_request(record, asked)
+
+    assert fault() == ""
+    assert fault(seed=3) == "it was run with seed 3, the round asks for 0"
+    assert "stride 2" in fault(stride=2)
+    assert "degrade {'blur': 1}" in fault(degrade={"blur": 1})
+    assert "tracker 'orb-slam2'" in fault(tracker="orb-slam2")
+    assert fault("imported") == "it is no run, but imported"
+
+
+def test_rows_agree_only_with_one_status_and_coverage(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    row = Row(entry="still", sequence=opened.sequences[0], run_id="0" * 20)
+    one = ScoredRow("alice", row, "lost", None, 0.25)
+    assert agreement(opened, one, replace(one, by="bob"))[0] == "reproduced"
+    assert agreement(opened, one, replace(one, status="ok"))[0] == "differs"
+    assert agreement(opened, one, replace(one, coverage=0.5))[0] == "differs"
+    assert agreement(opened, one, replace(one, ate_m=0.1))[0] == "differs"
+
+
+def test_the_board_ranks_complete_entries_first_and_an_error_of_zero_before_any() -> None:
+    values = {"coverage": 1.0, "of_scenes": 4, "not_ok": 0, "run_by": "alice"}
+    rows = [
+        BoardRow("none", None, scenes=4, **values),  # type: ignore[arg-type]
+        BoardRow("part", 0.0, scenes=3, **values),  # type: ignore[arg-type]
+        BoardRow("best", 0.0, scenes=4, **values),  # type: ignore[arg-type]
+        BoardRow("good", 0.1, scenes=4, **values),  # type: ignore[arg-type]
+    ]
+    rows.sort(key=lambda row: row.rank)
+    assert [row.entry for row in rows] == ["best", "good", "none", "part"]
+    assert rows[-1].cells[2:4] == ("100.0 %", "3 of 4")
+
+
 # -- a whole round ---------------------------------------------------------------------------------
 
 
@@ -348,6 +459,7 @@ def second_machine(root: Path) -> None:
     changed_trajectory(root)
     better_trajectory(root)
     changed_truth(root)
+    changed_records(root)
     changed_tracker(root)
     late_entry(root)
 
@@ -414,6 +526,33 @@ def changed_truth(root: Path) -> None:
     assert (
         sum("ground truth is not that of the scene" in fault for fault in verification.faults) == 3
     )
+    restore(root, backup)
+
+
+def changed_records(root: Path) -> None:
+    """Status, coverage, kind and digests of scenes are not the runner's word; nor is it free to leave out scenes."""
+    run, _ = row_of(root, "still")
+    backup = root.parent / "alice"
+    for changes, words in (
+        ({"coverage": 0.5}, "it says poses at 2 of 4 frames, its trajectory has 4"),
+        ({"status": "lost"}, "it says lost, its trajectory says ok"),
+        ({"kind": "imported"}, "it is no run, but imported"),
+    ):
+        shutil.copytree(root / "results" / "alice", backup)
+        record = json.loads((run / "run.json").read_text())
+        (run / "run.json").write_text(json.dumps(record | changes))
+        forge(root, run, run / "trajectory_online.txt")
+        faults = rounds.verify(root, by="bob", sample=0).faults
+        assert any(words in fault for fault in faults), faults
+        restore(root, backup)
+    shutil.copytree(root / "results" / "alice", backup)
+    file = root / "results" / "alice" / "results.json"
+    results = json.loads(file.read_text())
+    file.write_text(json.dumps(results | {"scenes": {}, "rows": results["rows"][1:]}))
+    faults = rounds.verify(root, by="bob", sample=0).faults
+    assert sum("has no digest in results.json" in fault for fault in faults) == 2
+    assert sum("lacks 1 of 2 scenes" in fault for fault in faults) == 1
+    assert len(faults) == 3
     restore(root, backup)
 
 
