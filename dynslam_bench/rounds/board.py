@@ -6,7 +6,7 @@ from statistics import mean, median
 
 from dynslam_bench.core import DynslamError, ReportError, write_atomic
 from dynslam_bench.reports import build_report
-from dynslam_bench.rounds.files import RoundFolder, open_round
+from dynslam_bench.rounds.files import REVEAL_FILE, RoundFolder, open_round
 from dynslam_bench.rounds.rows import ScoredRow, agreement
 from dynslam_bench.rounds.running import check_release
 from dynslam_bench.rounds.verifying import checked_rows
@@ -182,7 +182,7 @@ def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
         f"Protocol {of.protocol}; rows agree where errors differ by at most {100 * of.tolerance:g} %.",
     ]
     if late:
-        remarks.append(f"Late, not run: {', '.join(late)}.")
+        remarks.append(f"Not listed in {REVEAL_FILE}, not run: {', '.join(late)}.")
     for by in runners:
         try:
             results = opened.read_results(by)
@@ -192,7 +192,8 @@ def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
         words = "no network" if results.network == "none" else "with the network open"
         remarks.append(
             f"{by}: {len(results.rows)} runs, {words}, on {machine.cpu}, {machine.system}, "
-            f"numpy {results.versions.get('numpy', '')}, numba {results.versions.get('numba', '')}."
+            f"numpy {results.versions.get('numpy', '')}, numba {results.versions.get('numba', '')}"
+            + ("; earlier rows on others." if results.mixed else ".")
         )
     return remarks
 

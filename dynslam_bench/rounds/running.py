@@ -1,18 +1,18 @@
 """`run`: the sealed scenes are rendered, the entries run on them, and the runs go into a bank."""
 
-import re
-import socket
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Literal
 
+import psutil
+
 from dynslam_bench.core import DynslamError, RunError, write_atomic
 from dynslam_bench.core.fingerprint import this_machine, versions
+from dynslam_bench.core.records import is_plain_name
 from dynslam_bench.rounds.bits import check_bits, scene_digest
 from dynslam_bench.rounds.files import (
-    PLAIN_NAME,
     RESULTS_FILE,
     Entry,
     Results,
@@ -21,7 +21,7 @@ from dynslam_bench.rounds.files import (
     open_round,
     stamp,
 )
-from dynslam_bench.rounds.programs import what_changed, working_in
+from dynslam_bench.rounds.programs import other_folder, what_changed, working_in
 from dynslam_bench.runs import bank
 from dynslam_bench.runs.many import OnFault, RunEvent, run_many
 from dynslam_bench.runs.spec import RunSpec
@@ -104,7 +104,7 @@ def check_runner(opened: RoundFolder, by: str) -> None:
     Raises:
         RunError: One does not hold.
     """
-    if not re.match(PLAIN_NAME, by):
+    if not is_plain_name(by):
         raise RunError(f"'{by}' is no name of a runner", "letters, digits, dots and dashes")
     check_release(opened)
 
@@ -139,6 +139,11 @@ def usable_entry(opened: RoundFolder, name: str) -> Entry:
         DynslamError: Its tracker is not here.
     """
     entry = opened.received_entry(name)
+    if fault := other_folder(entry, opened.root):
+        raise RunError(
+            f"the tracker of entry '{name}' is not the frozen one: {fault}",
+            f"restore {opened.root / 'entries' / name} as it was entered",
+        )
     if changed := what_changed(entry, opened.root, entry.trial.sequence):
         raise RunError(
             f"the tracker of entry '{name}' is not the frozen one: {changed} was changed since it was entered",
@@ -245,28 +250,37 @@ def _described(
     opened: RoundFolder, by: str, digests: dict[str, str], rows: Sequence[Row], *, sample: bool
 ) -> Results:
     """The description of a runner's bank after new rows."""
+    machine = this_machine()
+    packages = versions()
+    reached = network()
+    mixed = False
     scenes: dict[str, str] = {}
     every: dict[tuple[str, str], Row] = {}
     if (opened.bank(by) / RESULTS_FILE).is_file():
         earlier = opened.read_results(by)
         sample = sample and earlier.sample
+        # an entry that reached a network once may have taken what it keeps
+        reached = "open" if earlier.network == "open" else reached
+        mixed = earlier.mixed or (earlier.machine, earlier.versions) != (machine, packages)
         scenes |= earlier.scenes
         every |= {(row.entry, row.sequence): row for row in earlier.rows}
     every |= {(row.entry, row.sequence): row for row in rows}
     return Results(
         by=by,
         round_sha256=opened.sha256,
+        reveal_sha256=opened.reveal_sha256,
         scenes=scenes | digests,
         rows=list(every.values()),
         sample=sample,
-        network=network(),
+        network=reached,
         made=stamp(datetime.now(timezone.utc)),
-        machine=this_machine(),
-        versions=versions(),
+        machine=machine,
+        versions=packages,
+        mixed=mixed,
     )
 
 
 def network() -> Literal["none", "open"]:
-    """``none`` where this process, and what it starts, has no network interface but the loopback; else ``open``."""
-    names = {name for _, name in socket.if_nameindex()}
-    return "open" if names - {"lo", "lo0"} else "none"
+    """``none`` where no interface of this process, and what it starts, is up but the loopback; else ``open``."""
+    up = {name for name, state in psutil.net_if_stats().items() if state.isup}
+    return "open" if up - {"lo", "lo0"} else "none"

@@ -20,7 +20,7 @@ from dynslam_bench.rounds.files import (
     Row,
     open_round,
 )
-from dynslam_bench.rounds.programs import difference, program_of, working_in
+from dynslam_bench.rounds.programs import difference, foreign_read, program_of, working_in
 from dynslam_bench.rounds.rows import Agreement, ScoredRow, agreement, record_of, scored
 from dynslam_bench.rounds.running import (
     OnEvent,
@@ -287,6 +287,9 @@ def _fault_of_row(
         return fault
     if changed := difference(entry.program, program_of(entry.name, record.identity)):
         return f"it was run by another program than entered: {changed} was changed"
+
+    if file := foreign_read(entry.name, entry.folder, record.identity):
+        return f"it has read {file} of the round's folder, which is no frozen file of the entry"
 
     # stamps and ground truth need no rendering
     scene = open_synthetic(row.sequence, None)

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,7 +20,7 @@ from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
 from dynslam_bench.rounds.board import BoardRow
-from dynslam_bench.rounds.entering import check_is_new
+from dynslam_bench.rounds.entering import _check_own_files, check_is_new
 from dynslam_bench.rounds.files import (
     Program,
     RoundFolder,
@@ -28,9 +29,16 @@ from dynslam_bench.rounds.files import (
     open_round,
     renderer_versions,
 )
-from dynslam_bench.rounds.programs import difference, program_of
+from dynslam_bench.rounds.opening import _extend_gitignore, salt_place, work_tree_of
+from dynslam_bench.rounds.programs import (
+    difference,
+    folder_listing,
+    foreign_read,
+    other_folder,
+    program_of,
+)
 from dynslam_bench.rounds.rows import ScoredRow, agreement
-from dynslam_bench.rounds.running import check_runner
+from dynslam_bench.rounds.running import check_runner, network
 from dynslam_bench.rounds.verifying import _faults_of_pairs, _other_request, checked_rows
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
@@ -169,16 +177,145 @@ def test_the_deadline_separates_entering_and_revealing(tmp_path: Path) -> None:
         rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW)
 
 
+def test_an_entry_that_was_entered_after_the_deadline_is_not_revealed(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r", deadline="2026-11-29T12:00Z")
+    entered(opened, "late", entered="2026-11-29T14:00:00+02:00")
+    with pytest.raises(RunError, match=r"'late' was entered at 2026-11-29T12:00:00.* it is late"):
+        rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW)
+    entered(opened, "late", entered="2026-11-29T11:59:59+00:00")
+    assert "late" in rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW).entries
+
+
+def test_results_of_another_reveal_are_refused(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    results_of(opened, "alice", [], reveal_sha256="0" * 64)
+    with pytest.raises(RunError, match=r"is of another reveal\.json"):
+        opened.read_results("alice")
+
+
+def test_the_folder_of_an_entry_is_frozen_with_every_file(tmp_path: Path) -> None:
+    folder = tmp_path / "entries" / "mine"
+    (folder / "net").mkdir(parents=True)
+    (folder / "mine.py").write_text("a")
+    (folder / "net" / "weights.bin").write_bytes(b"b")
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "mine.pyc").write_bytes(b"c")
+    listing = folder_listing(folder)
+    assert list(listing) == ["mine.py", "net/weights.bin"]
+    entry = rounds.Entry.model_construct(name="mine", folder=listing)
+    assert other_folder(entry, tmp_path) == ""
+    (folder / "net" / "weights.bin").write_bytes(b"c")
+    assert other_folder(entry, tmp_path) == "entries/mine/net/weights.bin was changed"
+    (folder / "net" / "weights.bin").unlink()
+    assert other_folder(entry, tmp_path) == "entries/mine/net/weights.bin is missing"
+    (folder / "answers.txt").write_text("d")
+    assert other_folder(entry, tmp_path) == "entries/mine/answers.txt is extra"
+    (folder / "answers.txt").unlink()
+    (folder / "answers.txt").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RunError, match="is a link"):
+        other_folder(entry, tmp_path)
+
+
+def test_a_run_reads_no_file_of_the_round_but_its_own(tmp_path: Path) -> None:
+    folder = {"mine.py": "1", "net.bin": "2"}
+
+    def read(**files: str) -> str:
+        names = {name.replace("__", "/"): content for name, content in files.items()}
+        reads = Reads(files={f"work:/{name}": content for name, content in names.items()})
+        return foreign_read("mine", folder, {"reads": reads.model_dump()})
+
+    assert foreign_read("mine", folder, {}) == ""
+    assert read(**{"entries/mine/net.bin": "2", "entries/mine/sought": ""}) == ""
+    assert read(**{"entries/mine/net.bin": "3"}) == "entries/mine/net.bin"
+    assert read(**{"entries/other/net.bin": "2"}) == "entries/other/net.bin"
+    assert read(**{"reveal.json": "5"}) == "reveal.json"
+    reads = Reads(files={"plugin:/mine.py": "1", "plugin:/answers": "7", "/usr/lib/a.so": "8"})
+    assert foreign_read("mine", folder, {"reads": reads.model_dump()}) == "plugin:/answers"
+
+
+def test_files_of_an_entry_lie_in_its_folder_before_anything_runs(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    slam = tmp_path / "slam"
+    slam.write_text("#!/bin/sh\n")
+    slam.chmod(0o755)
+    own = opened.root / "entries" / "mine"
+    with pytest.raises(RunError, match=r"do not lie in entries/mine"):
+        _check_own_files(opened, "subprocess", {"command": str(slam)}, own)
+    own.mkdir(parents=True)
+    shutil.copy(slam, own / "slam")
+    _check_own_files(opened, "subprocess", {"command": str(own / "slam")}, own)
+    _check_own_files(opened, "never-move", {}, own)
+
+
+def test_damaged_entries_of_others_are_skipped_with_a_remark(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    entered(opened, "still")
+    opened.entry_file("broken").write_text("{")
+    lines: list[str] = []
+    with pytest.raises(RunError, match="entry 'still' is the same"):
+        check_is_new(opened, "never-move", opened.read_entry("still").program, lines.append)
+    assert "entry 'broken' is not compared" in lines[0]
+
+
+def test_a_gitignore_is_extended_and_a_salt_in_a_work_tree_is_noticed(tmp_path: Path) -> None:
+    file = tmp_path / ".gitignore"
+    file.write_text("*.bag\nreport/")
+    for _ in range(2):
+        _extend_gitignore(file)
+        assert file.read_text().splitlines() == [
+            "*.bag",
+            "report/",
+            "index.sqlite",
+            ".*.claim",
+            ".merging",
+        ]
+    (tmp_path / "a" / ".git").mkdir(parents=True)
+    assert work_tree_of(tmp_path / "a" / "b" / "r.salt") == tmp_path / "a"
+    assert work_tree_of(tmp_path / "b" / "r.salt") is None
+    assert salt_place(tmp_path / "r", tmp_path / "r" / "sub" / ".." / ".." / "s") == tmp_path / "s"
+    values = {"name": "2026a", "families": ["walking_xyz"], "scenes": 1, "frames": 4}
+    with pytest.raises(RunError, match="is published"):
+        rounds.new_round(tmp_path / "r", **values, salt_file=tmp_path / "sub" / ".." / "r" / "x")  # type: ignore[arg-type]
+
+
+def test_only_interfaces_that_are_up_are_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = {"lo": SimpleNamespace(isup=True), "sit0": SimpleNamespace(isup=False)}
+    monkeypatch.setattr("psutil.net_if_stats", lambda: states)
+    assert network() == "none"
+    states["eth0"] = SimpleNamespace(isup=True)
+    assert network() == "open"
+
+
+def test_a_command_is_started_again_without_a_network_only_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from dynslam_bench.cli import rounds as commands
+
+    started: list[dict[str, str]] = []
+    monkeypatch.setattr("dynslam_bench.rounds.running.network", lambda: "open")
+    monkeypatch.setattr(commands.shutil, "which", lambda _: "/usr/bin/unshare")
+    monkeypatch.setattr(commands.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
+    monkeypatch.setattr(commands.os, "execvpe", lambda *words: started.append(words[2]))
+    commands._leave_network()
+    assert len(started) == 1
+    monkeypatch.setattr(commands.os, "environ", started[0])
+    commands._leave_network()
+    assert len(started) == 1
+
+
 def test_names_of_entries_and_runners_are_plain_and_free(tmp_path: Path) -> None:
     opened = written(tmp_path / "r")
     entered(opened, "still")
     with pytest.raises(RunError, match="'still' already"):
         rounds.enter(opened.root, "never-move", name="still")
-    with pytest.raises(RunError, match="no name of an entry"):
-        rounds.enter(opened.root, "never-move", name="../still")
+    for name in ("../still", "still\n", ".still"):
+        with pytest.raises(RunError, match="no name of an entry"):
+            rounds.enter(opened.root, "never-move", name=name)
     rounds.reveal(opened.root, tmp_path / "r.salt")
     with pytest.raises(RunError, match="no name of a runner"):
         rounds.run(opened.root, by="a/b")
+    with pytest.raises(RunError, match="no name of a runner"):
+        rounds.run(opened.root, by="alice\n")
 
 
 def test_an_entry_counts_as_it_was_when_the_round_was_revealed(tmp_path: Path) -> None:
@@ -323,6 +460,7 @@ def results_of(
     values = {
         "by": by,
         "round_sha256": opened.sha256,
+        "reveal_sha256": opened.reveal_sha256,
         "scenes": {},
         "rows": [
             {"entry": entry, "sequence": sequence, "run_id": "0" * 20} for entry, sequence in rows
@@ -449,7 +587,7 @@ def second_machine(root: Path) -> None:
     assert [again.agreement for again in verification.rerun] == ["identical"] * 6
     shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     board = rounds.report(root)
-    assert "Late, not run: late." in board.remarks
+    assert "Not listed in reveal.json, not run: late." in board.remarks
     assert {row.entry for row in board.rows} == {"still", "orb", "mine"}
     assert all(row.reproduced == {"bob": (2, 2, 2)} for row in board.rows)
     assert board.faults == []
@@ -565,7 +703,7 @@ def changed_tracker(root: Path) -> None:
     file = root / "entries" / "mine" / "mine.py"
     before = file.read_text()
     file.write_text(before + "\n# better\n")
-    words = "the tracker of entry 'mine' is not the frozen one: the file mine.py was changed"
+    words = "the tracker of entry 'mine' is not the frozen one: entries/mine/mine.py was changed"
     with pytest.raises(RunError, match=words):
         rounds.run(root, by="carol", entries=["mine"])
     assert any(words in fault for fault in rounds.verify(root, by="bob", sample=0).faults)
