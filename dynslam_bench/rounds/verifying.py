@@ -124,8 +124,8 @@ def verify(
     # what each runner has published: checked without a run, then scored again
     for runner in runners:
         on_step(f"checking the results of {runner}")
-        published, faults = checked_rows(opened, runner, render=True)
-        verification.rows.extend(published)
+        rows, faults = checked_rows(opened, runner, render=True)
+        verification.rows.extend(rows)
         verification.faults.extend(faults)
 
     # a sample, run again here
