@@ -39,6 +39,8 @@ RoundResults = Annotated[
 ]
 _UNSHARE = ("unshare", "--net", "--map-root-user")
 """Starts a command without a network, by a user namespace of its own (unshare(1))."""
+_STARTED_AGAIN = "DYNSLAM_BENCH_WITHOUT_NETWORK"
+"""Environment variable that is set in a command that was started so: it is started once."""
 
 
 @app.command()
@@ -71,6 +73,7 @@ def new(
 ) -> None:
     """Draw a salt, and write the round that commits to it."""
     from dynslam_bench import rounds
+    from dynslam_bench.rounds.opening import salt_place, work_tree_of
 
     made = rounds.new_round(
         folder,
@@ -84,10 +87,13 @@ def new(
         tolerance=tolerance,
         salt_file=salt,
     )
+    place = salt_place(folder, salt)
+    if work_tree := work_tree_of(place):
+        announce(f"the salt {place} lies in the git work tree {work_tree}: never commit it")
     present(
         made,
         f"{folder / 'round.json'}: publish it; the salt's SHA-256 is {made.salt_sha256}",
-        f"{salt or f'{folder}.salt'}: the salt; keep it secret until the reveal",
+        f"{place}: the salt; keep it secret until the reveal",
     )
 
 
@@ -135,8 +141,9 @@ def reveal(
 ) -> None:
     """Publish the salt and the digests of the entries received; what comes later is late."""
     from dynslam_bench import rounds
+    from dynslam_bench.rounds.opening import salt_place
 
-    made = rounds.reveal(folder, salt or f"{folder.expanduser().absolute()}.salt")
+    made = rounds.reveal(folder, salt_place(folder, salt))
     rows = [(name, sha256) for name, sha256 in made.entries.items()]
     present(made, table(("entry", "SHA-256"), rows), f"{folder / 'reveal.json'}: publish it")
 
@@ -279,6 +286,9 @@ def _leave_network() -> None:
     if network() == "none":
         return
     is_allowed = False
+    if os.environ.get(_STARTED_AGAIN):
+        announce("entries run with the network open: an interface is up after unshare")
+        return
     if shutil.which(_UNSHARE[0]) is not None:
         tried = subprocess.run([*_UNSHARE, "true"], capture_output=True, check=False)
         is_allowed = tried.returncode == 0
@@ -286,4 +296,4 @@ def _leave_network() -> None:
         announce("entries run with the network open: this system does not let a user leave it")
         return
     command = [*_UNSHARE, sys.executable, "-m", "dynslam_bench", *sys.argv[1:]]
-    os.execvp(command[0], command)
+    os.execvpe(command[0], command, os.environ | {_STARTED_AGAIN: "1"})

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
@@ -12,12 +13,20 @@ from dynslam_bench.core.errors import DynslamError, did_you_mean
 from dynslam_bench.core.reading import RECORD_BYTES, read_text
 from dynslam_bench.core.sanitise import json_without_passwords, storable
 
+_PLAIN_NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+Name = Annotated[str, Field(pattern=f"^{_PLAIN_NAME}$")]
+"""Names of people, groups and entries, which become names of files."""
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Model = TypeVar("Model", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 """Sixteen hexadecimal digits, as `digest` makes them: the name of a sequence's part."""
 RunId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}([0-9a-f]{4})?$")]
 """Twenty hexadecimal digits: twelve of what was asked for, eight of what was read for it. Older runs have sixteen."""
+
+
+def is_plain_name(text: str) -> bool:
+    """Whether a text is a `Name`."""
+    return re.fullmatch(_PLAIN_NAME, text) is not None
 
 
 def schema(newest: int) -> Any:

@@ -5,19 +5,13 @@ from collections.abc import Iterable
 from dynslam_bench.core import RunError, find_data_root
 from dynslam_bench.rounds.files import Round
 from dynslam_bench.sequences.synthetic import open_synthetic
-from dynslam_bench.sequences.synthetic.digests import rendered_digest
-
-PROBE_FRAMES = 2
-"""Frames of a public scene that are compared: the second is the first with motion blur of what moves."""
+from dynslam_bench.sequences.synthetic.digests import probe_digest, rendered_digest
+from dynslam_bench.sequences.synthetic.ids import probe_id
 
 
 def probe_digests(families: Iterable[str]) -> dict[str, str]:
     """The digests of public scenes as this machine renders them, by the scene's id; nothing stored is read."""
-    digests = {}
-    for family in families:
-        sequence = open_synthetic(f"synthetic/{family}?scene=0&frames={PROBE_FRAMES}", None)
-        digests[sequence.id] = rendered_digest(sequence)
-    return digests
+    return {probe: probe_digest(probe) for probe in map(probe_id, families)}
 
 
 def check_bits(of: Round) -> None:

@@ -2,17 +2,27 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 from dynslam_bench.core import DynslamError, ReportError, write_atomic
 from dynslam_bench.reports import build_report
-from dynslam_bench.rounds.files import RoundFolder, open_round
-from dynslam_bench.rounds.rows import ScoredRow, agreement, scored
-from dynslam_bench.rounds.verifying import faults_of
+from dynslam_bench.rounds.files import REVEAL_FILE, RoundFolder, open_round
+from dynslam_bench.rounds.rows import ScoredRow, agreement
+from dynslam_bench.rounds.running import check_release
+from dynslam_bench.rounds.verifying import checked_rows
+from dynslam_bench.runs.record import coverage_text
 
 BOARD_FILE = "round.md"
 """The board as Markdown."""
-COLUMNS = ("entry", "median ATE (mm)", "scenes", "not ok", "run by", "reproduced by")
+COLUMNS = (
+    "entry",
+    "median ATE (mm)",
+    "coverage",
+    "scenes",
+    "not ok",
+    "run by",
+    "reproduced by",
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +32,9 @@ class BoardRow:
     Attributes:
         entry: Its name.
         median_ate_m: Median over its scenes of the error, metres; None without one.
+        coverage: Mean over its scenes of the share of the frames with a pose.
         scenes: Scenes on which it was run.
+        of_scenes: Scenes of the round.
         not_ok: Scenes on which it was lost or did not come to its end.
         run_by: The runner whose rows are shown: the one with most scenes.
         reproduced: By name of each other runner: how many rows agree, how many of these to the last
@@ -31,10 +43,19 @@ class BoardRow:
 
     entry: str
     median_ate_m: float | None
+    coverage: float
     scenes: int
+    of_scenes: int
     not_ok: int
     run_by: str
     reproduced: dict[str, tuple[int, int, int]] = field(default_factory=dict)
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """The order of the board: complete entries first, then fewer scenes not ok, then smaller errors."""
+        missing = self.of_scenes - self.scenes
+        error = float("inf") if self.median_ate_m is None else self.median_ate_m
+        return missing, self.not_ok, error
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -44,8 +65,9 @@ class BoardRow:
             f"{by}: {agree} of {rows}" + (f", {same} identical" if same else "")
             for by, (agree, same, rows) in self.reproduced.items()
         ]
-        counts = (str(self.scenes), str(self.not_ok))
-        return self.entry, error, *counts, self.run_by, "; ".join(words) or "nobody"
+        counts = (f"{self.scenes} of {self.of_scenes}", str(self.not_ok))
+        coverage = coverage_text(self.coverage)
+        return self.entry, error, coverage, *counts, self.run_by, "; ".join(words) or "nobody"
 
 
 @dataclass(frozen=True)
@@ -76,11 +98,11 @@ def report(folder: str | Path, output: str | Path | None = None) -> RoundReport:
         output: Folder of the report; ``report`` in the round's folder by default.
 
     Raises:
-        ReportError: Nobody has published results.
-        RunError: The round is not revealed, or its salt is another one.
+        ReportError: Nobody has published results, or none can be scored.
+        RunError: The round is not revealed, its salt is another one, or this installation does not fit.
     """
     opened = open_round(folder)
-    _ = opened.reveal
+    check_release(opened)
     runners = opened.runners()
     if not runners:
         raise ReportError(
@@ -93,25 +115,27 @@ def report(folder: str | Path, output: str | Path | None = None) -> RoundReport:
     faults: list[str] = []
     rows: list[ScoredRow] = []
     for by in runners:
-        faults += faults_of(opened, by, render=False)
-        for row in opened.read_results(by).rows:
-            try:
-                rows.append(scored(opened, by, row))
-            except DynslamError as error:
-                faults.append(f"{by}, {row.entry}: {error}")
+        scored_here, faults_here = checked_rows(opened, by, render=False)
+        rows += scored_here
+        faults += faults_here
     listed = [row for row in rows if row.row.entry in opened.reveal.entries]
     board = [
         _board_row(opened, entry, [row for row in listed if row.row.entry == entry])
         for entry in opened.reveal.entries
         if any(row.row.entry == entry for row in listed)
     ]
-    board.sort(key=lambda row: (row.not_ok, row.median_ate_m or float("inf")))
+    board.sort(key=lambda row: row.rank)
+    nobody = [name for name in opened.reveal.entries if name not in {row.entry for row in board}]
+    faults += [f"entry '{name}' has no row" for name in nobody]
 
     # the board, and the pages of the runner with most rows
     remarks = _remarks(opened, runners)
     markdown = target / BOARD_FILE
     write_atomic(markdown, _markdown(opened, remarks, board, faults))
-    reference = max(runners, key=lambda by: sum(row.by == by for row in listed))
+    readable = [by for by in runners if any(row.by == by for row in listed)]
+    if not readable:
+        raise ReportError(f"no row of round {opened.round.name} can be scored", faults[0])
+    reference = max(readable, key=lambda by: sum(row.by == by for row in listed))
     paths = build_report(
         [opened.bank(reference)],
         target,
@@ -139,7 +163,9 @@ def _board_row(opened: RoundFolder, entry: str, rows: list[ScoredRow]) -> BoardR
     return BoardRow(
         entry=entry,
         median_ate_m=median(errors) if errors else None,
+        coverage=mean(row.coverage for row in shown.values()),
         scenes=len(shown),
+        of_scenes=len(opened.sequences),
         not_ok=sum(row.status != "ok" for row in shown.values()),
         run_by=reference,
         reproduced=reproduced,
@@ -156,14 +182,18 @@ def _remarks(opened: RoundFolder, runners: list[str]) -> list[str]:
         f"Protocol {of.protocol}; rows agree where errors differ by at most {100 * of.tolerance:g} %.",
     ]
     if late:
-        remarks.append(f"Late, not run: {', '.join(late)}.")
+        remarks.append(f"Not listed in {REVEAL_FILE}, not run: {', '.join(late)}.")
     for by in runners:
-        results = opened.read_results(by)
+        try:
+            results = opened.read_results(by)
+        except DynslamError:
+            continue  # it is among the faults
         machine = results.machine
         words = "no network" if results.network == "none" else "with the network open"
         remarks.append(
             f"{by}: {len(results.rows)} runs, {words}, on {machine.cpu}, {machine.system}, "
-            f"numpy {results.versions.get('numpy', '')}, numba {results.versions.get('numba', '')}."
+            f"numpy {results.versions.get('numpy', '')}, numba {results.versions.get('numba', '')}"
+            + ("; earlier rows on others." if results.mixed else ".")
         )
     return remarks
 

@@ -1,17 +1,16 @@
 """`enter`: a tracker is frozen, checked and tried on public scenes."""
 
-import re
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core import RunError, TemporaryFolder, write_atomic
+from dynslam_bench.core import DynslamError, RunError, TemporaryFolder, write_atomic
 from dynslam_bench.core.fingerprint import this_machine, versions
+from dynslam_bench.core.records import is_plain_name
 from dynslam_bench.rounds.bits import check_bits
 from dynslam_bench.rounds.files import (
-    PLAIN_NAME,
     Entry,
     Program,
     RoundFolder,
@@ -19,7 +18,8 @@ from dynslam_bench.rounds.files import (
     open_round,
     stamp,
 )
-from dynslam_bench.rounds.programs import program_of, working_in
+from dynslam_bench.rounds.programs import folder_listing, foreign_read, program_of, working_in
+from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.many import run_many
 from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.spec import RunSpec
@@ -30,8 +30,8 @@ TRIAL_SCENE = 100
 """The public scene of the trial: the first held-out one."""
 TRIAL_FRAMES = 60
 """Frames of the trial at most: two seconds."""
-_PROGRAMS = ("subprocess:", "batch:")
-"""Beginnings of the names of trackers that are programs, whose files no package holds."""
+_PROGRAMS = ("subprocess", "batch")
+"""Ids of trackers that are programs, whose files no package holds."""
 
 
 def enter(
@@ -67,19 +67,27 @@ def enter(
     check_bits(opened.round)
 
     overrides = dict(settings or {})
+    own = opened.root / "entries" / name
+    before = folder_listing(own)
     with working_in(opened.root), closing(TemporaryFolder()) as folder_of_trial:
+        _check_own_files(opened, tracker, overrides, own)
         on_step("checking the tracker's contract")
         checks = _checked(tracker, overrides)
         on_step("running it on a public scene")
         trial, record = _tried(opened, tracker, overrides, RunStore(folder_of_trial.path))
 
-    program = program_of(name, record.identity)
-    if tracker.startswith(_PROGRAMS) and not program.files:
+    # what it is made of: its folder, and what it has read
+    if folder_listing(own) != before:
         raise RunError(
-            f"the program of '{tracker}' does not lie in entries/{name}: nobody could tell whether it changes",
-            f"put its files into {opened.root / 'entries' / name}, and name them from the round's folder",
+            f"the tracker writes into {own}, where its files are frozen",
+            "let it write into a temporary folder",
         )
-    check_is_new(opened, tracker, program)
+    if file := foreign_read(name, before, record.identity):
+        raise RunError(
+            f"the tracker has read {file} of the round's folder", f"put what it needs into {own}"
+        )
+    program = program_of(name, record.identity)
+    check_is_new(opened, tracker, program, on_step)
     entry = Entry(
         name=name,
         round_sha256=opened.sha256,
@@ -87,6 +95,7 @@ def enter(
         tracker=tracker,
         overrides=overrides,
         program=program,
+        folder=before,
         checks=checks,
         trial=trial,
         entered=stamp(now),
@@ -103,7 +112,7 @@ def _check_open(opened: RoundFolder, name: str, now: datetime) -> None:
     Raises:
         RunError: The name is none or is taken, or the round is over.
     """
-    if not re.match(PLAIN_NAME, name):
+    if not is_plain_name(name):
         raise RunError(f"'{name}' is no name of an entry", "letters, digits, dots and dashes")
     if opened.is_revealed:
         raise RunError(
@@ -123,14 +132,50 @@ def _check_open(opened: RoundFolder, name: str, now: datetime) -> None:
         )
 
 
-def check_is_new(opened: RoundFolder, tracker: str, program: Program) -> None:
-    """Check that no entry has the same program: the two would share their runs.
+def _check_own_files(
+    opened: RoundFolder, tracker: str, settings: dict[str, Any], own: Path
+) -> None:
+    """Check that a plug-in's file, or a file of a program, lies in the entry's folder.
+
+    Raises:
+        RunError: It lies elsewhere: nobody could tell whether it changes.
+        DynslamError: The tracker is unknown, or the settings do not fit.
+    """
+    sequence = f"synthetic/{opened.round.families[0]}?scene={TRIAL_SCENE}&frames=2"
+    resolved = resolve(RunSpec(tracker=tracker, sequence=sequence, settings=settings))
+    plugin = resolved.base_folders.plugin
+    is_elsewhere = plugin is not None and not is_below(plugin, own)
+    if resolved.tracker.id in _PROGRAMS:
+        is_elsewhere = not any(is_below(file, own) for file in resolved.files)
+    if is_elsewhere:
+        raise RunError(
+            f"the files of '{tracker}' do not lie in entries/{own.name}: nobody could tell whether they change",
+            f"put them into {own}, and name them from the round's folder",
+        )
+
+
+def is_below(path: Path, folder: Path) -> bool:
+    """Whether a path leads to a folder or below it, links followed."""
+    return path.resolve().is_relative_to(folder.resolve())
+
+
+def check_is_new(
+    opened: RoundFolder,
+    tracker: str,
+    program: Program,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Check that no entry has the same program: the two would share their runs; damaged entries are named and skipped.
 
     Raises:
         RunError: There is such an entry.
     """
     for name in opened.entry_names():
-        other = opened.read_entry(name)
+        try:
+            other = opened.read_entry(name)
+        except DynslamError as error:
+            on_step(f"entry '{name}' is not compared: {error.headline}")
+            continue
         if other.tracker == tracker and other.program == program:
             raise RunError(
                 f"entry '{name}' is the same tracker with the same settings", "enter it once"

@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, field_validator
 
 from dynslam_bench.core import DynslamError, RunError, did_you_mean, file_sha256, write_atomic
 from dynslam_bench.core.fingerprint import Machine
-from dynslam_bench.core.records import Record, schema
+from dynslam_bench.core.records import Name, Record, schema
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.runs.record import Status
 from dynslam_bench.runs.spec import RunSpec
@@ -33,11 +33,10 @@ ROUND_SCHEMA = 1
 """Version of the fields of all files of a round."""
 MOST_SCENES = 10_000
 """Scenes of a family at most."""
-PLAIN_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-"""Names of entries and runners, which become names of files."""
 
+Utc = Annotated[str, AfterValidator(lambda text: utc(text))]
+"""A time of ISO 8601 in UTC, to the second."""
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Name = Annotated[str, Field(pattern=PLAIN_NAME)]
 
 
 class RoundRecord(Record):
@@ -178,9 +177,10 @@ class Entry(RoundRecord):
         tracker: The tracker as ``run`` takes it, paths from the round's folder.
         overrides: Settings that were asked for.
         program: What must not change.
+        folder: SHA-256 of every file in ``entries/NAME``, by its path from there.
         checks: Names of the conformance checks that it passed.
         trial: Its run on a public scene.
-        entered: UTC, ISO 8601.
+        entered: UTC, ISO 8601, as the entrant's clock says.
         machine: The computer on which it was entered.
         versions: Versions of Python and of the packages that matter.
     """
@@ -191,9 +191,10 @@ class Entry(RoundRecord):
     tracker: str
     overrides: dict[str, Any] = Field(default_factory=dict)
     program: Program
+    folder: dict[str, Sha256] = Field(default_factory=dict)
     checks: list[str]
     trial: Trial
-    entered: str
+    entered: Utc
     machine: Machine
     versions: dict[str, str]
 
@@ -234,22 +235,30 @@ class Results(RoundRecord):
     Attributes:
         by: Name of the runner.
         round_sha256: SHA-256 of ``round.json``.
+        reveal_sha256: SHA-256 of ``reveal.json``.
         scenes: Digest of the bits of each scene as they were rendered there, by its id.
         rows: The runs.
-        network: ``none`` where no entry could reach a network, else ``open``.
+        sample: Whether all rows are a sample that a verifier has drawn: then scenes may be missing.
+        network: ``none`` where no entry could reach a network in any row, else ``open``.
         made: UTC, ISO 8601.
-        machine: The computer.
-        versions: Versions of Python and of the packages that matter.
+        machine: The computer; that of the last rows where `mixed`.
+        versions: Versions of Python and of the packages that matter; those of the last rows where
+            `mixed`.
+        mixed: Whether earlier rows were made on another computer or with other versions; the record
+            of each run says which.
     """
 
     by: Name
     round_sha256: Sha256
+    reveal_sha256: Sha256
     scenes: dict[str, Sha256]
     rows: list[Row]
+    sample: bool = False
     network: Literal["none", "open"]
     made: str
     machine: Machine
     versions: dict[str, str]
+    mixed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,6 +314,11 @@ class RoundFolder:
         return revealed
 
     @property
+    def reveal_sha256(self) -> str:
+        """SHA-256 of the reveal's file."""
+        return file_sha256(self.root / REVEAL_FILE)
+
+    @property
     def salt(self) -> bytes:
         """The published salt."""
         return parse_salt(self.reveal.salt)
@@ -347,10 +361,7 @@ class RoundFolder:
 
     def late_words(self, name: str) -> str:
         """Why an entry that the reveal does not list is not run."""
-        return (
-            f"entry '{name}' is not listed in {REVEAL_FILE}: "
-            f"it came after the reveal of {self.reveal.revealed}"
-        )
+        return f"entry '{name}' is not listed in {REVEAL_FILE}"
 
     def received_entry(self, name: str) -> Entry:
         """An entry that was received in time, unchanged since.
@@ -390,7 +401,7 @@ class RoundFolder:
         """The description of a runner's bank.
 
         Raises:
-            RunError: There is none, or it is of another round or runner.
+            RunError: There is none, or it is of another round, reveal or runner.
         """
         file = self.bank(by) / RESULTS_FILE
         if not file.is_file():
@@ -402,6 +413,12 @@ class RoundFolder:
         self._check_round(results.round_sha256, str(file))
         if results.by != by:
             raise RunError(f"{file} names '{results.by}' as its runner", "its folder has that name")
+        if results.reveal_sha256 != self.reveal_sha256:
+            raise RunError(
+                f"{file} is of another {REVEAL_FILE}: its SHA-256 was {results.reveal_sha256[:16]}, "
+                f"here it is {self.reveal_sha256[:16]}",
+                f"restore the {REVEAL_FILE} that was published",
+            )
         return results
 
     def _check_round(self, stated: str, what: str) -> None:
@@ -459,7 +476,12 @@ def reveal(folder: str | Path, salt_file: str | Path, *, now: datetime | None = 
     check_salt(opened.round, salt, str(salt_file))
     # an entry that does not fit the round is refused here, by name
     for name in opened.entry_names():
-        opened.read_entry(name)
+        entered = opened.read_entry(name).entered
+        if deadline and entered >= deadline:
+            raise RunError(
+                f"entry '{name}' was entered at {entered}, the deadline was {deadline}: it is late",
+                f"remove {opened.entry_file(name)}",
+            )
     entries = {name: file_sha256(opened.entry_file(name)) for name in opened.entry_names()}
     made = Reveal(round_sha256=opened.sha256, salt=salt.hex(), entries=entries, revealed=stamp(now))
     write_atomic(opened.root / REVEAL_FILE, made.to_json())

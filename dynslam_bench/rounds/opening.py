@@ -6,13 +6,16 @@ import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
-from dynslam_bench.core import RunError, translate_errors, write_atomic
+from dynslam_bench.core import RunError, read_text, translate_errors, write_atomic
 from dynslam_bench.core.records import validated
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import probe_digests
 from dynslam_bench.rounds.files import ROUND_FILE, Round, renderer_versions
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL
 from dynslam_bench.sequences.synthetic.sealed import SALT_BYTES
+
+_COMPUTED = ("index.sqlite", "report/", ".*.claim", ".merging")
+"""Files that can be computed again at any time: no part of a repository."""
 
 
 def new_round(
@@ -48,10 +51,10 @@ def new_round(
         RunError: A value does not fit, or one of the files exists.
     """
     root = Path(folder).expanduser().absolute()
-    salt_path = Path(salt_file or f"{root}.salt").expanduser().absolute()
+    salt_path = salt_place(folder, salt_file)
     if (root / ROUND_FILE).exists():
         raise RunError(f"{root / ROUND_FILE} exists already", "name another folder")
-    if salt_path.is_relative_to(root):
+    if salt_path.is_relative_to(root.resolve()):
         raise RunError(
             f"the salt {salt_path} would lie in the round's folder, which is published",
             "name another place: --salt FILE",
@@ -87,6 +90,30 @@ def new_round(
         with os.fdopen(descriptor, "w", encoding="ascii") as file:
             file.write(salt.hex() + "\n")
     write_atomic(root / ROUND_FILE, made.to_json())
-    # what can be computed again at any time is no part of a repository
-    write_atomic(root / ".gitignore", "index.sqlite\nreport/\n.*.claim\n.merging\n")
+    _extend_gitignore(root / ".gitignore")
     return made
+
+
+def salt_place(folder: str | Path, salt_file: str | Path | None = None) -> Path:
+    """The path of a round's salt, links followed: ``FOLDER.salt`` by default."""
+    root = Path(folder).expanduser().absolute()
+    return Path(salt_file or f"{root.resolve()}.salt").expanduser().resolve()
+
+
+def work_tree_of(file: Path) -> Path | None:
+    """The git work tree in which a file lies; None for none."""
+    return next((folder for folder in file.parents if (folder / ".git").exists()), None)
+
+
+def _extend_gitignore(file: Path) -> None:
+    """Add what can be computed again at any time to a ``.gitignore``; lines that are there stay.
+
+    Raises:
+        DynslamError: It cannot be read or written.
+    """
+    before = read_text(file) if file.is_file() else ""
+    missing = [line for line in _COMPUTED if line not in before.splitlines()]
+    if before and not before.endswith("\n"):
+        before += "\n"
+    if missing:
+        write_atomic(file, before + "".join(f"{line}\n" for line in missing))

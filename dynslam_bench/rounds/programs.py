@@ -8,8 +8,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from dynslam_bench.core import RunError, file_sha256, translate_errors
 from dynslam_bench.core.libraries import library_identity
-from dynslam_bench.core.reads import ABSENT, UNREADABLE, BaseFolders, Reads, Verifier
+from dynslam_bench.core.reads import (
+    ABSENT,
+    BYTE_CODE_FOLDER,
+    UNREADABLE,
+    BaseFolders,
+    Reads,
+    Verifier,
+)
 from dynslam_bench.rounds.files import Entry, Program
 from dynslam_bench.runs.identity import resolve
 from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
@@ -17,8 +25,9 @@ from dynslam_bench.runs.own_code import is_file, is_outside_package, module_of
 _BEFORE_ENTRIES = re.compile(r"/[^\"\s]*?/(?=entries/)")
 """The part of an absolute path that differs from machine to machine: the round's folder."""
 _PLUGIN_FILES = "plugin:"
+_WORK_FILES = "work:/"
 _ENTRY_FILES = "work:/entries/"
-"""Beginnings of names of files that lie beside the plug-in and below the round's ``entries``, see `BaseFolders`."""
+"""Beginnings of names of files beside the plug-in, in the round's folder, below its ``entries``; see `BaseFolders`."""
 _VERSION = "its version"
 
 
@@ -65,6 +74,71 @@ def program_of(name: str, identity: Mapping[str, Any]) -> Program:
         weights=_portable(identity.get("weights", {})),
         files=files,
     )
+
+
+def folder_listing(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file in a folder by its path from there, without compiled byte code; none without a folder.
+
+    Raises:
+        RunError: Something in it is a link or cannot be read.
+    """
+    listing = {}
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder)
+        if BYTE_CODE_FOLDER in inside.parts:
+            continue
+        if path.is_symlink():
+            raise RunError(f"{path} is a link", "put the file in its place")
+        if path.is_file():
+            with translate_errors(RunError, f"cannot read {path}"):
+                listing[inside.as_posix()] = file_sha256(path)
+    return listing
+
+
+def other_folder(entry: Entry, root: Path) -> str:
+    """The first file of ``entries/NAME`` that is extra, missing or changed since it was frozen; empty for none.
+
+    Raises:
+        RunError: Something in it is a link or cannot be read.
+    """
+    here = folder_listing(root / "entries" / entry.name)
+    for file in sorted(here.keys() | entry.folder.keys()):
+        path = f"entries/{entry.name}/{file}"
+        if file not in here:
+            return f"{path} is missing"
+        if file not in entry.folder:
+            return f"{path} is extra"
+        if here[file] != entry.folder[file]:
+            return f"{path} was changed"
+    return ""
+
+
+def foreign_read(entry: str, folder: Mapping[str, str], identity: Mapping[str, Any]) -> str:
+    """A file of the round's folder that a run has read and that is none of the entry's own; empty for none.
+
+    Args:
+        entry: Name of the entry.
+        folder: The entry's own files with their SHA-256, as `folder_listing` gives them.
+        identity: As the run's record has it.
+    """
+    reads = identity.get("reads")
+    if reads is None:
+        return ""
+    read = Reads.model_validate(reads)
+    own = f"{_ENTRY_FILES}{entry}/"
+    for name, content in sorted({**read.programs, **read.files}.items()):
+        is_beside_plugin = name.startswith(_PLUGIN_FILES) and not name.endswith("/")
+        if is_beside_plugin and BYTE_CODE_FOLDER not in name:
+            if content not in (ABSENT, UNREADABLE, *folder.values()):
+                return name
+        is_file_of_round = name.startswith(_WORK_FILES) and not name.endswith("/")
+        if not is_file_of_round or content in (ABSENT, UNREADABLE) or BYTE_CODE_FOLDER in name:
+            continue
+        if not name.startswith(own):
+            return name.removeprefix(_WORK_FILES)
+        if folder.get(name.removeprefix(own)) != content:
+            return name.removeprefix(_WORK_FILES)
+    return ""
 
 
 def _portable(values: Mapping[str, Any]) -> dict[str, Any]:

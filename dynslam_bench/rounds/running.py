@@ -1,18 +1,18 @@
 """`run`: the sealed scenes are rendered, the entries run on them, and the runs go into a bank."""
 
-import re
-import socket
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Literal
 
+import psutil
+
 from dynslam_bench.core import DynslamError, RunError, write_atomic
 from dynslam_bench.core.fingerprint import this_machine, versions
+from dynslam_bench.core.records import is_plain_name
 from dynslam_bench.rounds.bits import check_bits, scene_digest
 from dynslam_bench.rounds.files import (
-    PLAIN_NAME,
     RESULTS_FILE,
     Entry,
     Results,
@@ -21,7 +21,7 @@ from dynslam_bench.rounds.files import (
     open_round,
     stamp,
 )
-from dynslam_bench.rounds.programs import what_changed, working_in
+from dynslam_bench.rounds.programs import other_folder, what_changed, working_in
 from dynslam_bench.runs import bank
 from dynslam_bench.runs.many import OnFault, RunEvent, run_many
 from dynslam_bench.runs.spec import RunSpec
@@ -104,8 +104,17 @@ def check_runner(opened: RoundFolder, by: str) -> None:
     Raises:
         RunError: One does not hold.
     """
-    if not re.match(PLAIN_NAME, by):
+    if not is_plain_name(by):
         raise RunError(f"'{by}' is no name of a runner", "letters, digits, dots and dashes")
+    check_release(opened)
+
+
+def check_release(opened: RoundFolder) -> None:
+    """Check that a round is revealed and fits this installation.
+
+    Raises:
+        RunError: One does not hold.
+    """
     _ = opened.reveal
     opened.round.check_here()
 
@@ -130,6 +139,11 @@ def usable_entry(opened: RoundFolder, name: str) -> Entry:
         DynslamError: Its tracker is not here.
     """
     entry = opened.received_entry(name)
+    if fault := other_folder(entry, opened.root):
+        raise RunError(
+            f"the tracker of entry '{name}' is not the frozen one: {fault}",
+            f"restore {opened.root / 'entries' / name} as it was entered",
+        )
     if changed := what_changed(entry, opened.root, entry.trial.sequence):
         raise RunError(
             f"the tracker of entry '{name}' is not the frozen one: {changed} was changed since it was entered",
@@ -147,6 +161,7 @@ def make_rows(
     jobs: int,
     on_step: Callable[[str], None],
     on_event: OnEvent | None,
+    sample: bool = False,
 ) -> RoundRuns:
     """Run entries on scenes, add the runs to the runner's bank, and describe the bank.
 
@@ -158,6 +173,7 @@ def make_rows(
         jobs: Runs at a time.
         on_step: Called with each step in words.
         on_event: Called with every `RunEvent`.
+        sample: Whether the pairs are a sample of a verifier.
 
     Raises:
         DynslamError: The round's bank cannot be written, or has faults.
@@ -194,9 +210,9 @@ def make_rows(
 
     # the bank, and which rows it holds: those of earlier calls, too
     folder = opened.bank(by)
-    results_here = _described(opened, by, digests, rows)
+    results_here = _described(opened, by, digests, rows, sample=sample)
     if rows:
-        left_out = bank.add([store.root], folder).left_out
+        left_out = bank.add([store.root], folder, protocol=opened.round.protocol).left_out
         failed += [f"left out of the bank: {entry.path}: {entry.reason}" for entry in left_out]
         write_atomic(folder / RESULTS_FILE, results_here.to_json())
     return RoundRuns(results_here, folder, rows, failed)
@@ -231,29 +247,40 @@ def _made(
 
 
 def _described(
-    opened: RoundFolder, by: str, digests: dict[str, str], rows: Sequence[Row]
+    opened: RoundFolder, by: str, digests: dict[str, str], rows: Sequence[Row], *, sample: bool
 ) -> Results:
     """The description of a runner's bank after new rows."""
+    machine = this_machine()
+    packages = versions()
+    reached = network()
+    mixed = False
     scenes: dict[str, str] = {}
     every: dict[tuple[str, str], Row] = {}
     if (opened.bank(by) / RESULTS_FILE).is_file():
         earlier = opened.read_results(by)
+        sample = sample and earlier.sample
+        # an entry that reached a network once may have taken what it keeps
+        reached = "open" if earlier.network == "open" else reached
+        mixed = earlier.mixed or (earlier.machine, earlier.versions) != (machine, packages)
         scenes |= earlier.scenes
         every |= {(row.entry, row.sequence): row for row in earlier.rows}
     every |= {(row.entry, row.sequence): row for row in rows}
     return Results(
         by=by,
         round_sha256=opened.sha256,
+        reveal_sha256=opened.reveal_sha256,
         scenes=scenes | digests,
         rows=list(every.values()),
-        network=network(),
+        sample=sample,
+        network=reached,
         made=stamp(datetime.now(timezone.utc)),
-        machine=this_machine(),
-        versions=versions(),
+        machine=machine,
+        versions=packages,
+        mixed=mixed,
     )
 
 
 def network() -> Literal["none", "open"]:
-    """``none`` where this process, and what it starts, has no network interface but the loopback; else ``open``."""
-    names = {name for _, name in socket.if_nameindex()}
-    return "open" if names - {"lo", "lo0"} else "none"
+    """``none`` where no interface of this process, and what it starts, is up but the loopback; else ``open``."""
+    up = {name for name, state in psutil.net_if_stats().items() if state.isup}
+    return "open" if up - {"lo", "lo0"} else "none"

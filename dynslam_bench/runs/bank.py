@@ -503,10 +503,11 @@ def _merge(sources: Sequence[RunStore], bank: str | Path, protocol: str = "") ->
     """
     with _changing(bank) as store:
         description = _joined_description(sources, store, protocol)
+        # rendering may fail: before anything is added
+        probes = _probes_of(sources, description)
         merged = merge(sources, store, trials=False)
         for source in sources:
             merged.left_out.extend(_copy_marks(source, store))
-        probes = _probes_of(sources, description)
         whole = description.model_copy(update={"probes": probes})
         write_atomic(store.root / DESCRIPTION_FILE, whole.to_json())
     return merged

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
 
 from pydantic import Field
 
 from dynslam_bench.core import DynslamError, RunError
 from dynslam_bench.core.fingerprint import Machine
-from dynslam_bench.core.records import Record, RunId, schema
+from dynslam_bench.core.records import Name, Record, RunId, is_plain_name, schema
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.runs.layout import Unreadable
 from dynslam_bench.runs.record import RunRecord
@@ -21,9 +19,6 @@ DESCRIPTION_FILE = "bank.json"
 """Holds the description of a bank; older banks have none."""
 MARKS_FOLDER = "marks"
 """Holds the marks, one file for each row and name: ``marks/<run_id>/<name>.json``."""
-NAME = r"^[A-Za-z0-9][A-Za-z0-9.-]{0,63}$"
-"""Names of people and groups: they become names of files."""
-Name = Annotated[str, Field(pattern=NAME)]
 
 
 class BankDescription(Record):
@@ -144,7 +139,7 @@ def mark_file(bank: Path, run_id: str, by: str) -> Path:
     Raises:
         RunError: The name is none.
     """
-    if not re.match(NAME, by):
+    if not is_plain_name(by):
         raise RunError(f"'{by}' is no name for a mark", "letters, digits, dots and dashes")
     return bank / MARKS_FOLDER / run_id / f"{by}.json"
 

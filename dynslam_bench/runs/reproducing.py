@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +26,11 @@ REPEATS = 2
 """Further starts that are run where the new trajectory is not the row's to the last bit."""
 _REPEATED = ("seed", "offset", "sequence", "content", "id_taken_by")
 """Entries of an identity in which repeats of one row differ; `sequence` by the noise alone."""
+
+_COMMANDS = {"subprocess": "command", "batch": "program"}
+"""Ids of trackers that run a program, and the setting that names it."""
+_CODE = re.compile(r"[^:]*[\w\-]+(\.py)?:[A-Za-z_][\w.]*|.*\.py(:.*)?")
+"""A module or a file of Python with the name of what is taken from it: ``module:Attr``, ``file.py:Attr``."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,8 @@ def reproduce(
         row: Id of the row, or its first digits.
         by: Who runs it, as the mark shows it.
         tracker: Where the tracker is on this machine, if its id does not find it, e.g.
-            ``own.py:Attr``.
+            ``own.py:Attr``. A program, a file or a module that a row names runs only if it is named
+            here.
         sequence: Where the sequence is on this machine, if its id does not find it: a folder.
         repeats: Further starts that are run here at most.
         results: Results folder for the new runs.
@@ -87,7 +94,8 @@ def reproduce(
 
     Raises:
         RunError: There is no such row, it is an import or has no error, the bank has faults, this
-            machine renders other bits, the tracker is not here, or the row is another run here.
+            machine renders other bits, the tracker is not here or is code that only the row names,
+            or the row is another run here.
         DynslamError: The run cannot be made or stored.
     """
     store = Bank(bank)
@@ -198,10 +206,14 @@ def _resolved(
     """
     info = record.tracker
     given = tracker or info.given or info.id
+    _refuse_code_of_others(record, given, is_named=bool(tracker))
+    settings = dict(record.overrides)
+    if info.id in _COMMANDS and ":" in tracker:
+        settings.pop(_COMMANDS[info.id], None)  # the one that the user has named
     spec = RunSpec(
         tracker=given,
         sequence=sequence or record.sequence.id,
-        settings=record.overrides,
+        settings=settings,
         frames=record.frames,
         offset=record.offset,
         stride=record.stride,
@@ -237,6 +249,43 @@ def _resolved(
             "fetch the sequence again, or install the release of the row",
         )
     return resolved
+
+
+def _refuse_code_of_others(record: RunRecord, given: str, *, is_named: bool) -> None:
+    """Refuse to run a program, a file or a module that only the row names: its author chose it, not the user.
+
+    Args:
+        record: The row's.
+        given: The tracker that would be run.
+        is_named: Whether the user has named it.
+
+    Raises:
+        RunError: The row names one, and the user has not.
+    """
+    row = f"row {record.run_id}"
+    info = record.tracker
+    # a program, whose command is a setting
+    if info.id in _COMMANDS and not (is_named and ":" in given):
+        setting = _COMMANDS[info.id]
+        command = record.settings.get(setting, record.overrides.get(setting, "none"))
+        raise RunError(
+            f"{row} runs a program of its author, which nobody has checked: {command!r}",
+            f"look at it, and name it: --tracker '{info.id}:...'",
+        )
+    if is_named:
+        return
+    # a file or a module, as the tracker or in a setting
+    if _CODE.fullmatch(given):
+        raise RunError(
+            f"tracker '{info.id}' of {row} is code that only the row names: {given!r}",
+            "look at it, and say where it is with --tracker",
+        )
+    for name, value in record.overrides.items():
+        if isinstance(value, str) and _CODE.fullmatch(value):
+            raise RunError(
+                f"the setting {name} of {row} is code that only the row names: {value!r}",
+                f"look at it, and name the tracker: --tracker {given}",
+            )
 
 
 def _check_tracker(record: RunRecord, given: str) -> None:

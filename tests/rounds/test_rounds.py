@@ -6,8 +6,10 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,16 +19,28 @@ from dynslam_bench.core.fingerprint import this_machine
 from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.rounds.bits import check_bits
-from dynslam_bench.rounds.entering import check_is_new
+from dynslam_bench.rounds.board import BoardRow
+from dynslam_bench.rounds.entering import _check_own_files, check_is_new
 from dynslam_bench.rounds.files import (
     Program,
     RoundFolder,
+    Row,
     Trial,
     open_round,
     renderer_versions,
 )
-from dynslam_bench.rounds.programs import difference, program_of
-from dynslam_bench.rounds.running import check_runner
+from dynslam_bench.rounds.opening import _extend_gitignore, salt_place, work_tree_of
+from dynslam_bench.rounds.programs import (
+    difference,
+    folder_listing,
+    foreign_read,
+    other_folder,
+    program_of,
+)
+from dynslam_bench.rounds.rows import ScoredRow, agreement
+from dynslam_bench.rounds.running import check_runner, network
+from dynslam_bench.rounds.verifying import _faults_of_pairs, _other_request, checked_rows
+from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.testing.template import write_tracker_template
 
@@ -163,16 +177,145 @@ def test_the_deadline_separates_entering_and_revealing(tmp_path: Path) -> None:
         rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW)
 
 
+def test_an_entry_that_was_entered_after_the_deadline_is_not_revealed(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r", deadline="2026-11-29T12:00Z")
+    entered(opened, "late", entered="2026-11-29T14:00:00+02:00")
+    with pytest.raises(RunError, match=r"'late' was entered at 2026-11-29T12:00:00.* it is late"):
+        rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW)
+    entered(opened, "late", entered="2026-11-29T11:59:59+00:00")
+    assert "late" in rounds.reveal(opened.root, tmp_path / "r.salt", now=NOW).entries
+
+
+def test_results_of_another_reveal_are_refused(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    results_of(opened, "alice", [], reveal_sha256="0" * 64)
+    with pytest.raises(RunError, match=r"is of another reveal\.json"):
+        opened.read_results("alice")
+
+
+def test_the_folder_of_an_entry_is_frozen_with_every_file(tmp_path: Path) -> None:
+    folder = tmp_path / "entries" / "mine"
+    (folder / "net").mkdir(parents=True)
+    (folder / "mine.py").write_text("a")
+    (folder / "net" / "weights.bin").write_bytes(b"b")
+    (folder / "__pycache__").mkdir()
+    (folder / "__pycache__" / "mine.pyc").write_bytes(b"c")
+    listing = folder_listing(folder)
+    assert list(listing) == ["mine.py", "net/weights.bin"]
+    entry = rounds.Entry.model_construct(name="mine", folder=listing)
+    assert other_folder(entry, tmp_path) == ""
+    (folder / "net" / "weights.bin").write_bytes(b"c")
+    assert other_folder(entry, tmp_path) == "entries/mine/net/weights.bin was changed"
+    (folder / "net" / "weights.bin").unlink()
+    assert other_folder(entry, tmp_path) == "entries/mine/net/weights.bin is missing"
+    (folder / "answers.txt").write_text("d")
+    assert other_folder(entry, tmp_path) == "entries/mine/answers.txt is extra"
+    (folder / "answers.txt").unlink()
+    (folder / "answers.txt").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RunError, match="is a link"):
+        other_folder(entry, tmp_path)
+
+
+def test_a_run_reads_no_file_of_the_round_but_its_own(tmp_path: Path) -> None:
+    folder = {"mine.py": "1", "net.bin": "2"}
+
+    def read(**files: str) -> str:
+        names = {name.replace("__", "/"): content for name, content in files.items()}
+        reads = Reads(files={f"work:/{name}": content for name, content in names.items()})
+        return foreign_read("mine", folder, {"reads": reads.model_dump()})
+
+    assert foreign_read("mine", folder, {}) == ""
+    assert read(**{"entries/mine/net.bin": "2", "entries/mine/sought": ""}) == ""
+    assert read(**{"entries/mine/net.bin": "3"}) == "entries/mine/net.bin"
+    assert read(**{"entries/other/net.bin": "2"}) == "entries/other/net.bin"
+    assert read(**{"reveal.json": "5"}) == "reveal.json"
+    reads = Reads(files={"plugin:/mine.py": "1", "plugin:/answers": "7", "/usr/lib/a.so": "8"})
+    assert foreign_read("mine", folder, {"reads": reads.model_dump()}) == "plugin:/answers"
+
+
+def test_files_of_an_entry_lie_in_its_folder_before_anything_runs(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    slam = tmp_path / "slam"
+    slam.write_text("#!/bin/sh\n")
+    slam.chmod(0o755)
+    own = opened.root / "entries" / "mine"
+    with pytest.raises(RunError, match=r"do not lie in entries/mine"):
+        _check_own_files(opened, "subprocess", {"command": str(slam)}, own)
+    own.mkdir(parents=True)
+    shutil.copy(slam, own / "slam")
+    _check_own_files(opened, "subprocess", {"command": str(own / "slam")}, own)
+    _check_own_files(opened, "never-move", {}, own)
+
+
+def test_damaged_entries_of_others_are_skipped_with_a_remark(tmp_path: Path) -> None:
+    opened = written(tmp_path / "r")
+    entered(opened, "still")
+    opened.entry_file("broken").write_text("{")
+    lines: list[str] = []
+    with pytest.raises(RunError, match="entry 'still' is the same"):
+        check_is_new(opened, "never-move", opened.read_entry("still").program, lines.append)
+    assert "entry 'broken' is not compared" in lines[0]
+
+
+def test_a_gitignore_is_extended_and_a_salt_in_a_work_tree_is_noticed(tmp_path: Path) -> None:
+    file = tmp_path / ".gitignore"
+    file.write_text("*.bag\nreport/")
+    for _ in range(2):
+        _extend_gitignore(file)
+        assert file.read_text().splitlines() == [
+            "*.bag",
+            "report/",
+            "index.sqlite",
+            ".*.claim",
+            ".merging",
+        ]
+    (tmp_path / "a" / ".git").mkdir(parents=True)
+    assert work_tree_of(tmp_path / "a" / "b" / "r.salt") == tmp_path / "a"
+    assert work_tree_of(tmp_path / "b" / "r.salt") is None
+    assert salt_place(tmp_path / "r", tmp_path / "r" / "sub" / ".." / ".." / "s") == tmp_path / "s"
+    values = {"name": "2026a", "families": ["walking_xyz"], "scenes": 1, "frames": 4}
+    with pytest.raises(RunError, match="is published"):
+        rounds.new_round(tmp_path / "r", **values, salt_file=tmp_path / "sub" / ".." / "r" / "x")  # type: ignore[arg-type]
+
+
+def test_only_interfaces_that_are_up_are_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = {"lo": SimpleNamespace(isup=True), "sit0": SimpleNamespace(isup=False)}
+    monkeypatch.setattr("psutil.net_if_stats", lambda: states)
+    assert network() == "none"
+    states["eth0"] = SimpleNamespace(isup=True)
+    assert network() == "open"
+
+
+def test_a_command_is_started_again_without_a_network_only_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from dynslam_bench.cli import rounds as commands
+
+    started: list[dict[str, str]] = []
+    monkeypatch.setattr("dynslam_bench.rounds.running.network", lambda: "open")
+    monkeypatch.setattr(commands.shutil, "which", lambda _: "/usr/bin/unshare")
+    monkeypatch.setattr(commands.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
+    monkeypatch.setattr(commands.os, "execvpe", lambda *words: started.append(words[2]))
+    commands._leave_network()
+    assert len(started) == 1
+    monkeypatch.setattr(commands.os, "environ", started[0])
+    commands._leave_network()
+    assert len(started) == 1
+
+
 def test_names_of_entries_and_runners_are_plain_and_free(tmp_path: Path) -> None:
     opened = written(tmp_path / "r")
     entered(opened, "still")
     with pytest.raises(RunError, match="'still' already"):
         rounds.enter(opened.root, "never-move", name="still")
-    with pytest.raises(RunError, match="no name of an entry"):
-        rounds.enter(opened.root, "never-move", name="../still")
+    for name in ("../still", "still\n", ".still"):
+        with pytest.raises(RunError, match="no name of an entry"):
+            rounds.enter(opened.root, "never-move", name=name)
     rounds.reveal(opened.root, tmp_path / "r.salt")
     with pytest.raises(RunError, match="no name of a runner"):
         rounds.run(opened.root, by="a/b")
+    with pytest.raises(RunError, match="no name of a runner"):
+        rounds.run(opened.root, by="alice\n")
 
 
 def test_an_entry_counts_as_it_was_when_the_round_was_revealed(tmp_path: Path) -> None:
@@ -307,6 +450,112 @@ def test_an_entry_is_frozen_with_its_own_files_and_its_package() -> None:
     assert program.code["package numpy"]
 
 
+# -- results of others -----------------------------------------------------------------------------
+
+
+def results_of(
+    opened: RoundFolder, by: str, rows: list[tuple[str, str]], **changes: object
+) -> Path:
+    """Write the description of a runner's bank."""
+    values = {
+        "by": by,
+        "round_sha256": opened.sha256,
+        "reveal_sha256": opened.reveal_sha256,
+        "scenes": {},
+        "rows": [
+            {"entry": entry, "sequence": sequence, "run_id": "0" * 20} for entry, sequence in rows
+        ],
+        "network": "none",
+        "made": "2026-11-29T12:00:00+00:00",
+        "machine": this_machine(),
+        "versions": {},
+    }
+    file = opened.bank(by) / "results.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(rounds.Results.model_validate(values | changes).to_json())
+    return file
+
+
+def revealed(root: Path, *names: str) -> RoundFolder:
+    """A round with entries that is revealed."""
+    opened = written(root)
+    for name in names:
+        entered(opened, name)
+    rounds.reveal(root, f"{root}.salt")
+    return open_round(root)
+
+
+def test_each_entry_has_each_scene_once_but_in_a_sample(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    first, *others = opened.sequences
+    rows = [("still", first), ("still", first), ("still", others[0])]
+    results_of(opened, "alice", rows)
+    faults = _faults_of_pairs(opened, opened.read_results("alice"))
+    assert faults == [
+        "still on walking_xyz 0 has 2 rows",
+        "still lacks 2 of 4 scenes: crowd_xyz 0, crowd_xyz 1",
+    ]
+    results_of(opened, "bob", rows[1:], sample=True)
+    assert _faults_of_pairs(opened, opened.read_results("bob")) == []
+
+
+@pytest.mark.parametrize("content", [b"{", b"\xff\xfe", b"[]"])
+def test_damaged_results_of_one_runner_are_a_fault_of_that_runner(
+    content: bytes, tmp_path: Path
+) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    file = results_of(opened, "alice", [])
+    file.write_bytes(content)
+    rows, faults = checked_rows(opened, "alice", render=False)
+    assert rows == []
+    (fault,) = faults
+    assert fault.startswith("alice: ")
+    # one who calls himself otherwise than his folder
+    shutil.copyfile(results_of(opened, "bob", []), file)
+    assert "names 'bob' as its runner" in checked_rows(opened, "alice", render=False)[1][0]
+    with pytest.raises(DynslamError, match="no row of round 2026a can be scored"):
+        rounds.report(opened.root)
+
+
+def test_a_run_must_be_what_the_round_asks_for() -> None:
+    asked = {"tracker": "never-move", "seed": 0, "stride": 1, "device": "cpu", "degrade": {}}
+    identity = asked | {"device": "cuda:0"}
+
+    def fault(kind: str = "run", **changes: object) -> str:
+        record = RunRecord.model_construct(kind=kind, identity=identity | changes)
+        return _other_request(record, asked)
+
+    assert fault() == ""
+    assert fault(seed=3) == "it was run with seed 3, the round asks for 0"
+    assert "stride 2" in fault(stride=2)
+    assert "degrade {'blur': 1}" in fault(degrade={"blur": 1})
+    assert "tracker 'orb-slam2'" in fault(tracker="orb-slam2")
+    assert fault("imported") == "it is no run, but imported"
+
+
+def test_rows_agree_only_with_one_status_and_coverage(tmp_path: Path) -> None:
+    opened = revealed(tmp_path / "r", "still")
+    row = Row(entry="still", sequence=opened.sequences[0], run_id="0" * 20)
+    one = ScoredRow("alice", row, "lost", None, 0.25)
+    assert agreement(opened, one, replace(one, by="bob"))[0] == "reproduced"
+    assert agreement(opened, one, replace(one, status="ok"))[0] == "differs"
+    assert agreement(opened, one, replace(one, coverage=0.5))[0] == "differs"
+    assert agreement(opened, one, replace(one, ate_m=0.1))[0] == "differs"
+
+
+def test_the_board_ranks_complete_entries_first_and_an_error_of_zero_before_any() -> None:
+    values = {"coverage": 1.0, "of_scenes": 4, "not_ok": 0, "run_by": "alice"}
+    rows = [
+        BoardRow("none", None, scenes=4, **values),  # type: ignore[arg-type]
+        BoardRow("part", 0.0, scenes=3, **values),  # type: ignore[arg-type]
+        BoardRow("best", 0.0, scenes=4, **values),  # type: ignore[arg-type]
+        BoardRow("good", 0.1, scenes=4, **values),  # type: ignore[arg-type]
+    ]
+    rows.sort(key=lambda row: row.rank)
+    assert [row.entry for row in rows] == ["best", "good", "none", "part"]
+    assert rows[-1].cells[2:4] == ("100.0 %", "3 of 4")
+
+
 # -- a whole round ---------------------------------------------------------------------------------
 
 
@@ -338,7 +587,7 @@ def second_machine(root: Path) -> None:
     assert [again.agreement for again in verification.rerun] == ["identical"] * 6
     shutil.copyfile(root / "entries" / "still.json", root / "entries" / "late.json")
     board = rounds.report(root)
-    assert "Late, not run: late." in board.remarks
+    assert "Not listed in reveal.json, not run: late." in board.remarks
     assert {row.entry for row in board.rows} == {"still", "orb", "mine"}
     assert all(row.reproduced == {"bob": (2, 2, 2)} for row in board.rows)
     assert board.faults == []
@@ -348,6 +597,7 @@ def second_machine(root: Path) -> None:
     changed_trajectory(root)
     better_trajectory(root)
     changed_truth(root)
+    changed_records(root)
     changed_tracker(root)
     late_entry(root)
 
@@ -417,6 +667,33 @@ def changed_truth(root: Path) -> None:
     restore(root, backup)
 
 
+def changed_records(root: Path) -> None:
+    """Status, coverage, kind and digests of scenes are not the runner's word; nor is it free to leave out scenes."""
+    run, _ = row_of(root, "still")
+    backup = root.parent / "alice"
+    for changes, words in (
+        ({"coverage": 0.5}, "it says poses at 2 of 4 frames, its trajectory has 4"),
+        ({"status": "lost"}, "it says lost, its trajectory says ok"),
+        ({"kind": "imported"}, "it is no run, but imported"),
+    ):
+        shutil.copytree(root / "results" / "alice", backup)
+        record = json.loads((run / "run.json").read_text())
+        (run / "run.json").write_text(json.dumps(record | changes))
+        forge(root, run, run / "trajectory_online.txt")
+        faults = rounds.verify(root, by="bob", sample=0).faults
+        assert any(words in fault for fault in faults), faults
+        restore(root, backup)
+    shutil.copytree(root / "results" / "alice", backup)
+    file = root / "results" / "alice" / "results.json"
+    results = json.loads(file.read_text())
+    file.write_text(json.dumps(results | {"scenes": {}, "rows": results["rows"][1:]}))
+    faults = rounds.verify(root, by="bob", sample=0).faults
+    assert sum("has no digest in results.json" in fault for fault in faults) == 2
+    assert sum("lacks 1 of 2 scenes" in fault for fault in faults) == 1
+    assert len(faults) == 3
+    restore(root, backup)
+
+
 def restore(root: Path, backup: Path) -> None:
     shutil.rmtree(root / "results" / "alice")
     backup.rename(root / "results" / "alice")
@@ -426,7 +703,7 @@ def changed_tracker(root: Path) -> None:
     file = root / "entries" / "mine" / "mine.py"
     before = file.read_text()
     file.write_text(before + "\n# better\n")
-    words = "the tracker of entry 'mine' is not the frozen one: the file mine.py was changed"
+    words = "the tracker of entry 'mine' is not the frozen one: entries/mine/mine.py was changed"
     with pytest.raises(RunError, match=words):
         rounds.run(root, by="carol", entries=["mine"])
     assert any(words in fault for fault in rounds.verify(root, by="bob", sample=0).faults)

@@ -8,6 +8,7 @@ import sys
 import zipfile
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from dynslam_bench.runs import RunSpec, RunStore, bank, import_trajectory, repro
 from dynslam_bench.runs.bank_files import BankDescription, Mark, read_description, read_marks
 from dynslam_bench.runs.bank_index import INDEX_PAGE, bank_rows, write_bank_index
 from dynslam_bench.runs.exchange.dataset_metadata import describe_data
-from dynslam_bench.runs.exchange.server_archives import KITTI_SEQUENCES, write_server_archive
-from dynslam_bench.runs.reproducing import reproduce
+from dynslam_bench.runs.exchange.server_archives import KITTI_SEQUENCES, _runs, write_server_archive
+from dynslam_bench.runs.reproducing import _refuse_code_of_others, reproduce
 from dynslam_bench.runs.submissions import CHECKER, check_submission
 from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.sequences.synthetic.ids import probe_id
@@ -188,7 +189,7 @@ def test_a_run_that_differs_beyond_its_repeats_gets_no_mark(
 @pytest.mark.slow
 def test_a_tracker_that_is_not_here_and_other_content_are_named(made, recording, tmp_path):
     first = RunStore(made).ids()[0]
-    with pytest.raises(RunError, match=r"tracker 'toy'.* of row \w+ is not installed here"):
+    with pytest.raises(RunError, match=r"tracker 'toy' of row \w+ is code that only the row names"):
         reproduce(made, first, by="b", results=tmp_path / "again")
     other = write_folder(tmp_path / "toy", 9)
     with pytest.raises(RunError, match="has other content here"):
@@ -348,7 +349,12 @@ def test_an_authors_numbers_of_tums_script_come_out_of_a_bank(tmp_path):
 def minari(folder: Path) -> Path:
     """The metadata of a Minari data set."""
     (folder / "data").mkdir(parents=True)
-    facts = {"dataset_id": "dynslam/masks-v0-static-v0", "total_episodes": 3, "total_steps": 60}
+    facts = {
+        "dataset_id": "dynslam/masks-v0-static-v0",
+        "env_spec": json.dumps({"id": "dynslam/SlamControl-v0"}),
+        "total_episodes": 3,
+        "total_steps": 60,
+    }
     (folder / "data" / "metadata.json").write_text(json.dumps(facts))
     (folder / "data" / "main_data.hdf5").write_bytes(b"\x89HDF\r\n")
     return folder
@@ -400,6 +406,84 @@ def test_metadata_are_valid_croissant(data_set):
     dataset = croissant.Dataset(jsonld=done.croissant)
     assert not dataset.metadata.ctx.issues.errors
     assert not dataset.metadata.ctx.issues.warnings
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[1]", "holds a list, expected an object"),
+        ("3", "holds a int, expected an object"),
+        ("{}", "names no environment of dynslam-bench in env_spec: nothing"),
+        ('{"env_spec": "{\\"id\\": \\"PointMaze-v3\\"}"}', "PointMaze-v3"),
+    ],
+)
+def test_other_data_of_minari_get_no_licence(content, words, tmp_path):
+    folder = minari(tmp_path / "minari")
+    (folder / "data" / "metadata.json").write_text(content)
+    with pytest.raises(RunError, match=words):
+        describe_data(folder)
+
+
+@pytest.mark.parametrize("name", ["DATA_CARD.md", "croissant.json"])
+def test_somebodys_own_card_and_metadata_stay(name, tmp_path):
+    folder = minari(tmp_path / "minari")
+    (folder / name).write_text("mine")
+    with pytest.raises(RunError, match="was not made by this command, and stays"):
+        describe_data(folder)
+    assert (folder / name).read_text() == "mine"
+    (folder / name).unlink()
+    describe_data(folder)
+    describe_data(folder)  # its own are replaced
+
+
+@pytest.mark.parametrize(
+    ("tracker", "overrides", "words"),
+    [
+        ({"id": "subprocess"}, {"command": "rm -rf ~"}, "runs a program of its author.*'rm -rf ~'"),
+        ({"id": "batch"}, {"program": "theirs.toml"}, "runs a program of its author.*theirs.toml"),
+        ({"id": "toy", "given": "theirs.py:SPEC"}, {}, "only the row names: 'theirs.py:SPEC'"),
+        ({"id": "toy", "given": "theirs.slam:SPEC"}, {}, "only the row names: 'theirs.slam:SPEC'"),
+        (
+            {"id": "orb-slam2"},
+            {"segmentation.source": "theirs.net:SPEC"},
+            "setting segmentation.source .* 'theirs.net:SPEC'",
+        ),
+    ],
+)
+def test_code_that_only_a_row_names_is_shown_and_not_run(tracker, overrides, words, imported):
+    record = RunStore(imported).all()[0][0]
+    info = record.tracker.model_copy(update={"given": ""} | tracker)
+    foreign = record.model_copy(update={"tracker": info, "overrides": overrides, "settings": {}})
+    given = info.given or info.id
+    with pytest.raises(RunError, match=words):
+        _refuse_code_of_others(foreign, given, is_named=False)
+    _refuse_code_of_others(foreign, f"{info.id}:mine", is_named=True)
+    if info.id in ("subprocess", "batch"):
+        with pytest.raises(RunError, match=words):
+            _refuse_code_of_others(foreign, info.id, is_named=True)
+
+
+def test_an_installed_tracker_with_plain_settings_runs_again(imported):
+    record = RunStore(imported).all()[0][0]
+    info = record.tracker.model_copy(update={"given": "", "id": "orb-slam2"})
+    own = record.model_copy(update={"tracker": info, "overrides": {"a.b": "cuda:0", "c": 3}})
+    _refuse_code_of_others(own, "orb-slam2", is_named=False)
+
+
+def test_of_runs_with_one_seed_the_newest_is_sent_and_the_others_are_named(tmp_path):
+    run_of_folder(tmp_path, "sofa_5")
+    store = RunStore(tmp_path / "results")
+    (first,) = store.all()[0]
+    newest = first.model_copy(update={"run_id": "1" * 20, "started": "2026-11-29T12:00:00+00:00"})
+    older = first.model_copy(update={"run_id": "2" * 20, "started": "2026-11-28T12:00:00+00:00"})
+    invalid = newest.model_copy(update={"run_id": "3" * 20, "kind": "run", "identity": {}})
+    records = [older, newest, invalid]
+    for order in (records, records[::-1]):
+        given = SimpleNamespace(all=lambda order=order: (order, []), source=store.source)
+        chosen, notes = _runs(given, "eth3d", "mine")
+        assert chosen["sofa_5"].run_id == newest.run_id
+        assert older.run_id in notes[0]
+        assert invalid.run_id in notes[0]
 
 
 def test_another_folder_is_no_data_set(tmp_path):

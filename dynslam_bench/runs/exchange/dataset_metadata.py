@@ -26,6 +26,8 @@ from dynslam_bench.sequences.synthetic import render_synthetic
 
 CROISSANT_FILE = "croissant.json"
 CARD_FILE = "DATA_CARD.md"
+_MADE = "<!-- made by: dynslam-bench describe -->"
+"""The first line of the card; a card without it, and the metadata beside it, are somebody's own, and stay."""
 CROISSANT = "http://mlcommons.org/croissant/1.0"
 CROISSANT_RAI = "http://mlcommons.org/croissant/RAI/1.0"
 _CONTEXT: dict[str, Any] = {
@@ -224,11 +226,26 @@ def describe_data(
     if str(source).startswith("synthetic/"):
         folder = render_synthetic(str(source), find_data_root(data_root))
     folder = folder.absolute()
+    _refuse_own_files(folder)
     kind, facts = _facts(folder)
     metadata = croissant(facts, url=url, creator=creator, today=today or date.today())
     write_atomic(folder / CROISSANT_FILE, json.dumps(metadata, indent=2) + "\n")
     write_atomic(folder / CARD_FILE, card(facts, url=url, creator=creator))
     return DescribedData(kind, folder / CROISSANT_FILE, folder / CARD_FILE)
+
+
+def _refuse_own_files(folder: Path) -> None:
+    """Refuse to replace a card or metadata that this module has not written.
+
+    Raises:
+        RunError: There is one.
+    """
+    card_file = folder / CARD_FILE
+    if card_file.is_file() and read_text(card_file).startswith(_MADE):
+        return
+    for file in (card_file, folder / CROISSANT_FILE):
+        if file.exists():
+            raise RunError(f"{file} was not made by this command, and stays", "rename it")
 
 
 def _facts(folder: Path) -> tuple[str, DatasetFacts]:
@@ -293,13 +310,22 @@ def _facts_of_minari(folder: Path) -> DatasetFacts:
     """The facts of recorded episodes, as Minari stores them.
 
     Raises:
-        RunError: Its metadata are no JSON.
+        RunError: Its metadata are no JSON object, or name no environment of this package.
     """
     file = folder / "data" / "metadata.json"
     try:
-        stated = dict(json.loads(read_text(file)))
+        stated = json.loads(read_text(file))
     except ValueError as error:
         raise RunError(f"{file} is not valid JSON: {error}") from error
+    if not isinstance(stated, dict):
+        raise RunError(f"{file} holds a {type(stated).__name__}, expected an object")
+    # other data have other licences and persons
+    environment = str(stated.get("env_spec", ""))
+    if "dynslam" not in environment:
+        raise RunError(
+            f"{file} names no environment of dynslam-bench in env_spec: {environment[:80] or 'nothing'}",
+            "only recordings of SLAM-Control are described",
+        )
     wanted = {"total_episodes": "episodes", "total_steps": "steps", "algorithm_name": "policy"}
     numbers = {words: str(stated[key]) for key, words in wanted.items() if key in stated}
     name = str(stated.get("dataset_id", folder.name))
@@ -516,7 +542,7 @@ def card(facts: DatasetFacts, *, url: str, creator: str) -> str:
         "cite": facts.citation,
         "synthetic data": "yes" if facts.synthetic else "no",
     }
-    lines = [f"# {facts.title}", "", facts.summary, ""]
+    lines = [_MADE, f"# {facts.title}", "", facts.summary, ""]
     lines += ["| fact | value |", "| --- | --- |"]
     lines += [f"| {name} | {value} |" for name, value in about.items() if value]
     lines += ["", "## Files", "", "| files | type | content |", "| --- | --- | --- |"]

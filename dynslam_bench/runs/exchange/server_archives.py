@@ -76,9 +76,8 @@ def write_server_archive(
     if path.suffix.lower() != ".zip":
         raise RunError(f"an archive is not written as '{path.name}'", "name a .zip file")
     store = results if isinstance(results, RunStore) else open_store(results)
-    chosen = _runs(store, server, tracker)
+    chosen, notes = _runs(store, server, tracker)
 
-    notes: list[str] = []
     texts = {}
     for name, record in sorted(chosen.items()):
         trajectory = _trajectory(store, record, which)
@@ -98,13 +97,14 @@ def write_server_archive(
     return ServerArchive(path, {f"{name}.txt": run.run_id for name, run in chosen.items()}, notes)
 
 
-def _runs(store: RunStore, server: str, tracker: str) -> dict[str, RunRecord]:
-    """The run of a tracker on each sequence of a server, by the server's name of the sequence.
+def _runs(store: RunStore, server: str, tracker: str) -> tuple[dict[str, RunRecord], list[str]]:
+    """The run of a tracker on each sequence of a server, by the server's name of the sequence, and remarks.
 
     Raises:
         RunError: There is none, a sequence of KITTI is missing, or runs have different settings.
     """
     chosen: dict[str, RunRecord] = {}
+    equal: dict[str, list[str]] = {}
     for record in store.all()[0]:
         name = _name_at(server, record)
         is_of_tracker = tracker in (record.tracker.id, record.tracker.label)
@@ -123,6 +123,12 @@ def _runs(store: RunStore, server: str, tracker: str) -> dict[str, RunRecord]:
         # of repeats the first one: nobody chooses the best of them
         if earlier is None or record.seed < earlier.seed:
             chosen[name] = record
+            equal[name] = []
+        elif record.seed == earlier.seed:
+            # of runs with one seed, e.g. by two releases, the newest whose id tells its code
+            is_newer = _validity_and_time(record) > _validity_and_time(earlier)
+            equal[name].append(earlier.run_id if is_newer else record.run_id)
+            chosen[name] = record if is_newer else earlier
     if not chosen:
         raise RunError(
             f"'{tracker}' has no whole run on a sequence of {server} in {store.source}",
@@ -131,7 +137,18 @@ def _runs(store: RunStore, server: str, tracker: str) -> dict[str, RunRecord]:
     missing = [name for name in KITTI_SEQUENCES if name not in chosen]
     if server == "kitti" and missing:
         raise RunError(f"KITTI takes all of 11 to 21 together: {', '.join(missing)} have no run")
-    return chosen
+    notes = [
+        f"{name}: run {chosen[name].run_id} of {chosen[name].started or 'no date'} is the newest with its seed; "
+        f"not taken: {', '.join(others)}"
+        for name, others in sorted(equal.items())
+        if others
+    ]
+    return chosen, notes
+
+
+def _validity_and_time(record: RunRecord) -> tuple[bool, str]:
+    """Whether a run's id tells what made it, and when it began: the larger of two is taken."""
+    return record.verified, record.started
 
 
 def _name_at(server: str, record: RunRecord) -> str:
