@@ -510,7 +510,7 @@ class Backend:
         tracked = TrackedFrame(observations, no_points, T_cam_world, frame.timestamp)
         self._last_frame = tracked
         # its features with depth become map points
-        timings, _ = self._insert_keyframe(frame, tracked)
+        timings, *_ = self._insert_keyframe(frame, tracked)
         self._update_active_map()
         # the pose defines the world, so that it is known exactly
         self._record_pose(frame, np.eye(4), KNOWN_POSE)
