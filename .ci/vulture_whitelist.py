@@ -13,6 +13,7 @@ rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
 modules_of_run  # runs.own_code: tests and a benchmark ask which modules count
 __class__  # runs.process.announcing: Python reads it
 inode  # runs.process.collector.Stamp: stamps are compared as a whole
+build_selfie  # segmentation.build_segmenter names it by its path
 compile_kernels  # cli.demo: processes of the tests' conftest call it
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 

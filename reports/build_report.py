@@ -692,10 +692,11 @@ def _program_notes(board: Board, loaded: LoadedRuns) -> list[str]:
             "Ranked by the program of their newest run, as none of several is the one installed here: "
             f"{', '.join(first_of(absent, _MOST_NOTES, 'and {} more'))}."
         )
+    sequences = {row.sequence.id for row in board.rows}
     in_future = [
         f"{row.label} on {row.sequence.id}, {row.repeat} ({row.started[:10]}, run {row.run_id})"
         for row in loaded.in_future
-        if row.variant_key in board.labels
+        if row.sequence.id in sequences
     ]
     if in_future:
         notes.append(

@@ -321,7 +321,7 @@ def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
 
 
 def _not_current(first: RunRow, second: RunRow) -> int:
-    """Sentence on rows by programs that do not rank."""
+    """Number of the two rows that are by a program that does not rank."""
     return (not first.is_current) + (not second.is_current)
 
 

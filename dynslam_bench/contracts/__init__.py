@@ -36,7 +36,13 @@ from dynslam_bench.contracts.filter import (
     Need,
 )
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, FlowSpec
-from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
+from dynslam_bench.contracts.segmenter import (
+    ForgetsFrames,
+    Instances,
+    Segmenter,
+    SegmenterContext,
+    SegmenterSpec,
+)
 from dynslam_bench.contracts.sequence import (
     DatasetSpec,
     Frame,
@@ -70,6 +76,7 @@ __all__ = [
     "FlowEstimator",
     "FlowResult",
     "FlowSpec",
+    "ForgetsFrames",
     "Frame",
     "FrameBundle",
     "FrameMasks",

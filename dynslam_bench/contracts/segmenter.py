@@ -111,3 +111,11 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame; no objects is an empty result, never an error."""
+
+
+@runtime_checkable
+class ForgetsFrames(Protocol):
+    """A segmenter that remembers frames, and forgets them where a new sequence begins. Its masks are not stored."""
+
+    def reset(self) -> None:
+        """Forget all frames."""

@@ -429,7 +429,7 @@ STAMP_TOLERANCE = 1e-3
 LONGEST_STEP_S = 1.0
 """Poses that are farther apart in time have a hole between them, unless the trajectory has keyframes alone."""
 LONGEST_STEP = 5.0
-"""The same in median steps of a trajectory, for one of keyframes."""
+"""Time between poses of a trajectory of keyframes that is no hole yet, in its median steps."""
 
 
 def share_of_time(stamps: ArrayLike, true_stamps: ArrayLike) -> float:

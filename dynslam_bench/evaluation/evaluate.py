@@ -27,7 +27,6 @@ from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.evaluation.uncertainty import (
-    NO_NOISE,
     PoseNoise,
     Uncertainty,
     motion_uncertainty,
@@ -124,7 +123,7 @@ def evaluate(
     *,
     input_timestamps: ArrayLike | None = None,
     motion_covariances: MotionCovariances | None = None,
-    truth_noise: PoseNoise = NO_NOISE,
+    truth_noise: PoseNoise | None = None,
 ) -> Evaluation:
     """Absolute and relative pose errors of a trajectory.
 
@@ -137,7 +136,8 @@ def evaluate(
             lost-frame policy ``hold``.
         motion_covariances: What the tracker says of its errors, see `motion_uncertainty`; they are
             scored with poses in metres alone.
-        truth_noise: Noise of the true poses, for the covariances.
+        truth_noise: Noise of the true poses, for the covariances; `NO_NOISE` if they are exact, None if it is
+            not known.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is

@@ -2,7 +2,7 @@
 
 Candidate and baseline run in turns on the same sequences. A round gives every sequence one natural
 logarithm of the candidate's error over the baseline's, below 0 is better. After 2, 3, 4, 6, 8 and 10
-rounds the mean over sequences is compared with 0 and with a margin, at levels that add up to 4 % in all
+rounds the mean over sequences is compared with 0 and with a margin, at levels that spend 4 % of false alarms in all
 (Kim and DeMets 1987, power function of degree 2). The scatter is that of the rounds within the
 sequences, so a claim is about these sequences, not about others like them (Jennison and Turnbull 1989,
 repeated confidence intervals).

@@ -619,7 +619,7 @@ def _pairs(stamps: Array) -> NDArray[np.intp]:
     """Indices ``[P, 2]`` of the poses between which motions are compared; none over holes.
 
     Args:
-        stamps: Of the poses ``[N]``, seconds, ascending.
+        stamps: Stamps of the poses ``[N]``, seconds, ascending.
     """
     # each pose, and the first one that is at least so much later
     apart_s = min(PAIR_S, (stamps[-1] - stamps[0]) / 3)

@@ -4,10 +4,6 @@ The error of a motion is the twist ``xi`` (translation in metres, rotation in ra
 ``T_true = T_estimated Exp(xi)``, a right perturbation. Its normalised estimation error squared,
 ``NEES = xi^T C^-1 xi``, is distributed as chi-square with six degrees of freedom if the covariance C is right
 (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Section 5.4).
-
-Over several frames the errors are taken for independent. An error before a motion ``T`` becomes
-``Ad(T^-1) xi`` behind it, so that ``C_ik = Ad(T_jk^-1) C_ij Ad(T_jk^-1)^T + C_jk``, with
-``Ad(T) = [[R, [t] R], [0, R]]`` (Barfoot, State Estimation for Robotics, 2017, Section 7.1).
 """
 
 from __future__ import annotations
@@ -18,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.geometry import Trajectory, se3
-from dynslam_bench.geometry.motion_covariances import MotionCovariances
+from dynslam_bench.geometry.motion_covariances import (
+    MotionCovariances,
+    adjoint,
+    between_poses,
+    check_covariances,
+    compose_covariances,
+)
 from dynslam_bench.geometry.se3 import Array
 
 DEGREES = 6
@@ -26,10 +28,6 @@ CHI2_95 = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
 CHI2_MEDIAN = 5.348
 """Median of chi-square with six degrees of freedom."""
-SYMMETRY = 1e-5
-"""Largest difference of a matrix of correlations from its transpose; files have six digits."""
-POSITIVE = 1e-9
-"""Least eigenvalue of a matrix of correlations; a smaller one is zero or negative by rounding."""
 SECOND_S = 1.0
 SECOND_TOLERANCE = 0.05
 """Share of a second by which the span of two frames may miss it."""
@@ -66,6 +64,9 @@ class PoseNoise:
 
 
 NO_NOISE = PoseNoise(0.0, 0.0)
+"""Noise of exact poses."""
+EXACT = "synthetic/"
+"""Beginning of the ids of rendered sequences, whose true poses are exact."""
 MOTION_CAPTURE = {
     "tum/": PoseNoise(1.5e-4, np.deg2rad(0.06)),
     "bonn/": PoseNoise(1.5e-4, np.deg2rad(0.13)),
@@ -74,12 +75,14 @@ MOTION_CAPTURE = {
 orientations over sqrt(20), which a smooth motion hardly adds to, on parts of fr1/xyz, fr1/rpy and crowd."""
 
 
-def truth_noise(sequence_id: str) -> PoseNoise:
-    """The noise of a sequence's true poses; none where it is not known, as for rendered ones, which are exact."""
+def truth_noise(sequence_id: str) -> PoseNoise | None:
+    """The noise of a sequence's true poses, `NO_NOISE` for exact ones; None where it is not known."""
+    if sequence_id.startswith(EXACT):
+        return NO_NOISE
     for prefix, noise in MOTION_CAPTURE.items():
         if sequence_id.startswith(prefix):
             return noise
-    return NO_NOISE
+    return None
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ def motion_uncertainty(
     estimate: Trajectory,
     covariances: MotionCovariances,
     truth: Trajectory,
-    noise: PoseNoise = NO_NOISE,
+    noise: PoseNoise | None = NO_NOISE,
 ) -> Uncertainty:
     """Score the covariances of a tracker's motions against its true errors.
 
@@ -112,16 +115,17 @@ def motion_uncertainty(
         estimate: Camera-to-world poses as they were when their frames came, in metres.
         covariances: Covariances of the motions to some or all of these frames.
         truth: True camera-to-world poses; those at the frames' stamps are interpolated.
-        noise: Noise of the true poses.
+        noise: Noise of the true poses; None where it is not known.
     """
     # the covariance of each motion between neighbouring poses; NaN where there is none
-    matrices = _matrices_of(estimate, covariances)
+    matrices = between_poses(estimate, covariances)
     given = len(matrices) - int(np.isnan(matrices).all(axis=(1, 2)).sum())
     is_valid, warnings = _validate(matrices, given)
     if not is_valid.any():
         return Uncertainty(warnings=warnings)
 
     # motions by estimate and truth, where there are both
+    known_noise = NO_NOISE if noise is None else noise
     poses, has_truth = _interpolated(truth, estimate.timestamps)
     after = np.arange(1, len(estimate))
     after = after[is_valid & has_truth[1:] & has_truth[:-1]]
@@ -130,22 +134,27 @@ def motion_uncertainty(
             warnings=warnings, diagnostics=["no motion with a covariance has true poses"]
         )
     pairs = np.stack([after - 1, after], axis=1)
-    one_frame = _Motions.of(estimate.T_world_cam, poses, pairs, matrices[after - 1], noise)
+    one_frame = _Motions.of(estimate.T_world_cam, poses, pairs, matrices[after - 1], known_noise)
 
     # over one second, where all covariances between are valid
     seconds = _pairs_over_a_second(estimate.timestamps, is_valid, has_truth)
-    composed = _compose(estimate.T_world_cam, matrices, seconds)
-    one_second = _Motions.of(estimate.T_world_cam, poses, seconds, composed, noise)
+    composed = compose_covariances(estimate.T_world_cam, matrices, seconds)
+    one_second = _Motions.of(estimate.T_world_cam, poses, seconds, composed, known_noise)
 
     metrics = one_frame.metrics("1f") | one_second.metrics("1s")
     source = (
-        f"the truth's own noise, {1e3 * noise.translation_m:.2g} mm and {np.rad2deg(noise.rotation_rad):.2g} deg"
-        if noise != NO_NOISE
+        f"the truth's own noise, {1e3 * known_noise.translation_m:.2g} mm and "
+        f"{np.rad2deg(known_noise.rotation_rad):.2g} deg"
+        if known_noise != NO_NOISE
         else "no noise of the truth"
     )
     diagnostics = [
         f"NEES over {len(pairs)} motions from frame to frame and {len(seconds)} over one second, with {source}"
     ]
+    if noise is None:
+        warnings.append(
+            "the noise of the true poses is not known: the NEES of the covariances includes the truth's errors"
+        )
     return Uncertainty(metrics, diagnostics, warnings + one_frame.doubts())
 
 
@@ -225,30 +234,6 @@ def nees(errors: Array, covariances: Array) -> Array:
     return np.asarray((scaled * np.linalg.solve(correlations, scaled[..., None])[..., 0]).sum(-1))
 
 
-def adjoint(pose: Array) -> Array:
-    """Adjoints ``[..., 6, 6]`` of poses ``[..., 4, 4]``: ``T Exp(xi) T^-1 = Exp(Ad(T) xi)``, translation first."""
-    rotation = pose[..., :3, :3]
-    result = np.zeros((*pose.shape[:-2], 6, 6))
-    result[..., :3, :3] = rotation
-    result[..., 3:, 3:] = rotation
-    result[..., :3, 3:] = se3.hat(pose[..., :3, 3]) @ rotation
-    return result
-
-
-def _matrices_of(estimate: Trajectory, covariances: MotionCovariances) -> Array:
-    """The covariance of the motion to each pose but the first, ``[N - 1, 6, 6]``; NaN where none was given."""
-    matrices = np.full((max(len(estimate) - 1, 0), 6, 6), np.nan)
-    # files hold stamps to the nanosecond
-    rows = {stamp: row for row, stamp in enumerate(np.rint(estimate.timestamps * 1e6).tolist())}
-    for stamp, matrix in zip(
-        np.rint(covariances.timestamps * 1e6).tolist(), covariances.matrices, strict=True
-    ):
-        row = rows.get(stamp, 0)
-        if row > 0:
-            matrices[row - 1] = matrix
-    return matrices
-
-
 def _validate(matrices: Array, given: int) -> tuple[NDArray[np.bool_], list[str]]:
     """Flags ``[M]`` of the covariances ``[M, 6, 6]`` that can be used, and a line for each kind of fault.
 
@@ -256,24 +241,8 @@ def _validate(matrices: Array, given: int) -> tuple[NDArray[np.bool_], list[str]
         matrices: The covariances.
         given: How many of them hold a number.
     """
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
-    safe = np.where(finite[:, None, None], matrices, np.eye(6))
-    diagonal = np.diagonal(safe, axis1=1, axis2=2)
-    with_variances = finite & (diagonal > 0).all(axis=1)
-    safe = np.where(with_variances[:, None, None], safe, np.eye(6))
-
-    # correlations, whatever the units
-    deviations = np.sqrt(np.diagonal(safe, axis1=1, axis2=2))
-    correlations = safe / (deviations[:, :, None] * deviations[:, None, :])
-    asymmetry = np.abs(correlations - np.swapaxes(correlations, 1, 2)).max(axis=(1, 2), initial=0)
-    symmetric = asymmetry <= SYMMETRY
-    halves = 0.5 * (correlations + np.swapaxes(correlations, 1, 2))
-    # NaN and infinite correlations come of variances that no float holds
-    finite_halves = np.isfinite(halves).all(axis=(1, 2))
-    halves = np.where(finite_halves[:, None, None], halves, -np.eye(6))
-    positive = with_variances & (np.linalg.eigvalsh(halves)[:, 0] > POSITIVE)
-
-    valid = finite & positive & symmetric
+    finite, positive, symmetric = check_covariances(matrices)
+    valid = positive & symmetric
     warnings = []
     missing = len(matrices) - given
     not_finite = given - int(np.count_nonzero(finite))
@@ -295,6 +264,9 @@ def _interpolated(truth: Trajectory, stamps: Array) -> tuple[Array, NDArray[np.b
     # the module takes long to load
     from scipy.spatial.transform import Rotation, Slerp
 
+    # of several true poses at one stamp the last counts, as in files
+    is_last = np.append(np.diff(truth.timestamps) > 0, True)[: len(truth)]
+    truth = truth.select(is_last)
     times = truth.timestamps
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     if len(times) < 2:
@@ -334,18 +306,3 @@ def _pairs_over_a_second(
     usable = near & unbroken & has_truth[pairs].all(axis=1) & (pairs[:, 1] > pairs[:, 0])
     chosen: NDArray[np.intp] = pairs[usable]
     return chosen
-
-
-def _compose(poses: Array, matrices: Array, pairs: NDArray[np.intp]) -> Array:
-    """Covariances ``[P, 6, 6]`` of the motions of pairs of poses, those from pose to pose being independent."""
-    total = np.zeros((len(pairs), 6, 6))
-    if not len(pairs):
-        return total
-    for step in range(int((pairs[:, 1] - pairs[:, 0]).max())):
-        at = pairs[:, 0] + step
-        active = at < pairs[:, 1]
-        at = at[active]
-        # transport what there is behind the next motion, and add its covariance
-        back = adjoint(se3.inverse(se3.between(poses, np.stack([at, at + 1], axis=1))))
-        total[active] = back @ total[active] @ np.swapaxes(back, -1, -2) + matrices[at]
-    return total

@@ -674,7 +674,7 @@ def resolution_floor(error: float, degrees_of_freedom: float, trackers: int, lev
 
     Args:
         error: Standard error of the log ratio.
-        degrees_of_freedom: Those of the standard error.
+        degrees_of_freedom: Degrees of freedom of the standard error.
         trackers: How many are compared with the reference (Bonferroni, Holm's first step).
         level: Chance of any false claim.
     """

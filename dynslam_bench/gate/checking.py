@@ -531,19 +531,18 @@ def _judged_by_files(side: Side, candidate: Side, recorded: Baseline, gate: Gate
     """
     _refuse_other_data(side, candidate)
     rounds = min(side.rounds(), candidate.rounds())
-    notes = []
-    for measured in (side, candidate):
-        copies = measured.cases_of_copies(rounds)
-        if not copies:
-            continue
-        notes.append(
-            f"runs of the {measured.name} are equal to the last bit on {', '.join(copies)}"
-        )
-        # without any scatter every difference would count as certain
-        if len(copies) == len(measured.by_case):
-            rounds = 1
-            notes[-1] += ", so its scatter is not known"
-    findings = judge(side, candidate, gate.config, rounds, one_look=True, timed=False)
+    copies = {measured.name: measured.cases_of_copies(rounds) for measured in (side, candidate)}
+    notes = [
+        f"runs of the {name} are equal to the last bit on {', '.join(cases)}: they count as one run, so the scatter "
+        "is not known"
+        for name, cases in copies.items()
+        if cases
+    ]
+    # their scatter of 0 would make the mean over all sequences look more certain than it is
+    findings = judge(
+        side, candidate, gate.config, rounds, one_look=True, timed=False, copies=bool(notes)
+    )
+    rounds = 1 if notes else rounds
     if rounds < 2 and findings.verdict is GateVerdict.UNDECIDED:
         notes.append(
             "one recorded run a sequence can show that all is identical, and nothing else: record two rounds or more"
@@ -783,16 +782,16 @@ def _result(
             result.low = math.exp(estimate.low)
             result.high = math.exp(estimate.high)
             result.level = findings.level
-    result.sentence = _sentence(result, findings.verdict)
+    result.sentence = _sentence(result, findings)
     return result
 
 
-def _sentence(result: GateResult, by_error: GateVerdict) -> str:
+def _sentence(result: GateResult, findings: Findings) -> str:
     """The verdict in one sentence.
 
     Args:
         result: All but the sentence.
-        by_error: The verdict on the error alone, which a guardrail may have overruled.
+        findings: The verdict on the error alone, and the guardrails that overrule it.
     """
     lost, lost_baseline = result.lost
     number = len(result.cases)
@@ -805,7 +804,7 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
     if all(case.baseline_m is None for case in result.cases):
         return f"all runs of the baseline were lost or failed on {on}, so nothing can be compared"
     overruling = "".join(
-        f"guardrail {guardrail.state}: {guardrail.text}; " for guardrail in result.overruling
+        f"guardrail {guardrail.state}: {guardrail.text}; " for guardrail in findings.overruling
     )
     more_lost = f"; lost runs {lost_baseline} -> {lost}" if lost != lost_baseline else ""
     if result.ratio is None:
@@ -819,7 +818,7 @@ def _sentence(result: GateResult, by_error: GateVerdict) -> str:
         GateVerdict.NO_DIFFERENCE: f"{measured}; differences above {100 * result.margin:g} % are excluded",
         GateVerdict.UNDECIDED: f"{measured} so far, within the scatter",
     }
-    return overruling + words[by_error] + more_lost
+    return overruling + words[findings.verdict] + more_lost
 
 
 def _written(result: GateResult, place: Path) -> GateResult:

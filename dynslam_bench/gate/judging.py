@@ -48,6 +48,7 @@ class Findings(NamedTuple):
         lost: Runs that the candidate lost, and the baseline.
         cases: Every sequence.
         guardrails: Every guardrail that the gate's file names.
+        overruling: The guardrails that keep the gate from passing: broken ones, else those that cannot be judged.
         exit_code: See `GateResult`.
     """
 
@@ -57,6 +58,7 @@ class Findings(NamedTuple):
     lost: tuple[int, int]
     cases: list[CaseResult]
     guardrails: list[GuardrailResult]
+    overruling: list[GuardrailResult]
     exit_code: int
 
     @property
@@ -91,6 +93,7 @@ def judge(
     *,
     one_look: bool = False,
     timed: bool = True,
+    copies: bool = False,
 ) -> Findings:
     """Judge the first rounds of both sides.
 
@@ -101,7 +104,12 @@ def judge(
         rounds: How many rounds are judged.
         one_look: Whether the data are looked at this once, as with recorded runs.
         timed: Whether times and memory were measured on one machine, in turns.
+        copies: Whether a side holds copies of one run in place of several: they show no scatter. Equality
+            is asked of all rounds then, everything else of the first.
     """
+    equal_rounds = rounds
+    if copies:
+        rounds = 1
     cases = list(candidate.by_case)
     level = ONE_LOOK if one_look else LOOKS.get(rounds, min(LOOKS.values()))
 
@@ -118,7 +126,7 @@ def judge(
     # equal trajectories first, then the interval against the margin; more lost runs overrule both
     verdict = GateVerdict.UNDECIDED
     all_lost = lost.all() or lost_baseline.all()
-    if are_identical(baseline, candidate, cases, rounds) and not all_lost:
+    if are_identical(baseline, candidate, cases, equal_rounds) and not all_lost:
         verdict = GateVerdict.IDENTICAL
     elif estimate is not None and not all_lost and rounds > 1:
         verdict = decide(estimate, counts, config.margin)
@@ -129,28 +137,35 @@ def judge(
 
     rows = _case_results(baseline, candidate, cases, rounds, ratios)
     guardrails = _guardrails(baseline, candidate, config, rounds, level, timed=timed)
-    code = _exit_code(verdict, guardrails, counts, all_lost=bool(all_lost), timed=timed)
-    return Findings(verdict, estimate, level, counts, rows, guardrails, code)
+    # runs in turns that do not tell their times leave a limit on them open
+    broken = [guardrail for guardrail in guardrails if guardrail.state == "broken"]
+    unknown = ("open", "not measured") if timed else ("open",)
+    unjudged = [guardrail for guardrail in guardrails if guardrail.state in unknown]
+    code = _exit_code(
+        verdict,
+        counts,
+        all_lost=bool(all_lost),
+        is_broken=bool(broken),
+        is_open=bool(unjudged),
+    )
+    overruling = {REGRESSED: broken, UNDECIDED: unjudged}.get(code, [])
+    return Findings(verdict, estimate, level, counts, rows, guardrails, overruling, code)
 
 
 def _exit_code(
     verdict: GateVerdict,
-    guardrails: Sequence[GuardrailResult],
     lost: tuple[int, int],
     *,
     all_lost: bool,
-    timed: bool,
+    is_broken: bool,
+    is_open: bool,
 ) -> int:
-    is_broken = any(guardrail.state == "broken" for guardrail in guardrails)
     if all_lost:
         return RUNS_FAILED
     if verdict is GateVerdict.REGRESSED or is_broken:
         return REGRESSED
     if verdict is GateVerdict.UNDECIDED and lost[0] > lost[1]:
         return RUNS_FAILED
-    # runs in turns that do not tell their times leave a limit on them open
-    unknown = ("open", "not measured") if timed else ("open",)
-    is_open = any(guardrail.state in unknown for guardrail in guardrails)
     return UNDECIDED if verdict is GateVerdict.UNDECIDED or is_open else PASSED
 
 

@@ -127,13 +127,6 @@ class GateResult(Record):
         return self.exit_code == PASSED
 
     @property
-    def overruling(self) -> list[GuardrailResult]:
-        """The guardrails that keep the gate from passing: broken ones, else those that cannot be judged."""
-        states = {REGRESSED: ("broken",), UNDECIDED: ("open", "not measured")}
-        kept = states.get(self.exit_code, ())
-        return [guardrail for guardrail in self.guardrails if guardrail.state in kept]
-
-    @property
     def worst(self) -> CaseResult | None:
         """The sequence whose error grew most; None where none has a ratio."""
         compared = [case for case in self.cases if case.ratio is not None]

@@ -333,13 +333,15 @@ def _faults_of_marks(store: Bank) -> list[str]:
     """Faults of a bank's description and marks, one line each."""
     try:
         description = read_description(store.root)
-        known = get_protocol(description.protocol).digest()
+        digest_here = get_protocol(description.protocol).digest()
     except DynslamError as error:
         return [str(error)]
     faults = []
-    if description.protocol_digest not in ("", known):
+    if description.protocol_digest not in ("", digest_here):
         stated = description.protocol_digest
-        faults.append(f"its protocol {description.protocol} has the digest {stated}, here {known}")
+        faults.append(
+            f"its protocol {description.protocol} has the digest {stated}, here {digest_here}"
+        )
     marks, unreadable = read_marks(store.root)
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
     rows = set(store.ids())
@@ -492,7 +494,7 @@ def add_mark(bank: str | Path, mark: Mark) -> None:
 
 
 def _merge(sources: Sequence[RunStore], bank: str | Path, protocol: str = "") -> Merged:
-    """Merge stores into a bank: the runs, the marks, and what holds for the bank.
+    """Merge stores into a bank: the runs, the marks, and the bank's description.
 
     Args:
         sources: Results folders and banks.
@@ -563,11 +565,11 @@ def _copy_marks(source: RunStore, store: Bank) -> Iterator[Unreadable]:
     description = read_description(source.root)
     rows = set(store.ids())
     for run_id, of_row in marks.items():
-        known = {mark.by: mark.made for mark in here.get(run_id, ())}
+        made_before = {mark.by: mark.made for mark in here.get(run_id, ())}
         for mark in of_row:
             if fault := mark.fault(description, rows):
                 yield Unreadable(mark_file(source.root, run_id, mark.by), fault)
-            elif mark.made > known.get(mark.by, ""):
+            elif mark.made > made_before.get(mark.by, ""):
                 write_atomic(mark_file(store.root, run_id, mark.by), mark.to_json())
 
 

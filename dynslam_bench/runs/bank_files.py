@@ -72,7 +72,7 @@ def read_description(bank: Path) -> BankDescription:
 
 
 class Mark(Record):
-    """Says that somebody has run a row again, and how far it came out.
+    """Statement that a person or machine has run a row again, and by how much the error differed.
 
     Attributes:
         schema_version: Version of this record's fields.
@@ -83,7 +83,7 @@ class Mark(Record):
         versions: Versions of Python and the packages that matter.
         protocol: Protocol of the errors.
         ate_m: The row's error, metres.
-        ate_again_m: That of the new run, metres.
+        ate_again_m: Error of the new run, metres.
         identical: Whether all trajectories are equal to the last bit that the files hold.
         repeats_differ_m: Largest difference between repeats, metres; None where none was needed.
         repeats: Number of repeats that were compared for it.

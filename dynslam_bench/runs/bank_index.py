@@ -15,7 +15,7 @@ from dynslam_bench.runs.record import RunRecord, coverage_text
 INDEX_PAGE = "README.md"
 """The page; hosts of git repositories show it below the list of files."""
 _MADE = "<!-- made by: dynslam-bench bank index -->"
-"""The first line of the page: a page without it is somebody's own, and stays."""
+"""The first line of the page: a page without it was written by a person, and stays."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def write_bank_index(bank: str | Path) -> tuple[Path, list[BankRow]]:
     """Write the index page of a bank; returns the page and the bank's rows.
 
     Raises:
-        RunError: It is no bank, has faults, or has a page of somebody's own.
+        RunError: It is no bank, has faults, or has a page that a person wrote.
         DynslamError: It cannot be written.
     """
     rows = bank_rows(bank)

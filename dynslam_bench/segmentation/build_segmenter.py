@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from dynslam_bench.contracts import (
+    ForgetsFrames,
     Frame,
     Instances,
     MaskSource,
@@ -364,9 +365,11 @@ def build_segmenter(
         "threads": threads,
     }
     cached = CachedSegmenter(partial(_load, name, sought, context), identity, cache, code)
-    # without a file there is nothing to wait for
+    # without a file there is nothing to wait for; masks that depend on earlier frames are not stored
     if not identity["weights"]:
-        cached.network()
+        network = cached.network()
+        if isinstance(network, ForgetsFrames):
+            return ConfiguredSegmenter(network, settings, source, also)
     return ConfiguredSegmenter(cached, settings, source, also)
 
 
@@ -498,7 +501,7 @@ class ConfiguredSegmenter:
 
     def reset(self) -> None:
         """Begin a new sequence: a segmenter that remembers frames forgets them."""
-        if hasattr(self.inner, "reset"):
+        if isinstance(self.inner, ForgetsFrames):
             self.inner.reset()
 
     def segment(self, frame: Frame) -> Instances:

@@ -275,11 +275,7 @@ class Backend:
 
         # insert a keyframe if the frame shows enough new
         result = self._update_map(frame, tracked, map_fit, pose_in_root_map)
-        result = _with_match_counts(result, map_fit, initial)
-        # a length in metres is known with depth alone
-        if not self.uses_depth:
-            return result
-        return replace(result, motion_covariance=motion_covariance(map_fit.estimate))
+        return _with_match_counts(result, map_fit, initial)
 
     # ------------------------------------------------------------------ steps of tracking
 
@@ -514,7 +510,7 @@ class Backend:
         tracked = TrackedFrame(observations, no_points, T_cam_world, frame.timestamp)
         self._last_frame = tracked
         # its features with depth become map points
-        timings, _ = self._insert_keyframe(frame, tracked)
+        timings, *_ = self._insert_keyframe(frame, tracked)
         self._update_active_map()
         # the pose defines the world, so that it is known exactly
         self._record_pose(frame, np.eye(4), KNOWN_POSE)
@@ -580,6 +576,7 @@ class Backend:
         """
         timings: dict[str, float] = {}
         root_map_pose = RootMapPose.REJECTED
+        moved_by_loop = False
         # the history keeps the pose by the image alone, which `trajectory` smooths at the end;
         # `tracked` holds the fused one
         pose = map_fit.estimate.T_cam_world
@@ -587,7 +584,9 @@ class Backend:
             self.map, tracked, frame.index, self._reference_keyframe
         )
         if self._mapping_enabled and needed:
-            timings, root_map_pose = self._insert_keyframe(frame, tracked, pose_in_root_map)
+            timings, root_map_pose, moved_by_loop = self._insert_keyframe(
+                frame, tracked, pose_in_root_map
+            )
             # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
             self.motion.relocate(pose)
@@ -599,9 +598,13 @@ class Backend:
         result = self._result(
             tracked.T_cam_world, timings, residual_px=map_fit.estimate.residual_px
         )
+        # the covariance is that of the fit, which knows nothing of a loop or of another map's place;
+        # metres are known with depth alone
+        in_root_map = self.atlas.active == ROOT_MAP
+        if self.uses_depth and in_root_map and not moved_by_loop:
+            result = replace(result, motion_covariance=motion_covariance(map_fit.estimate))
 
-        merged = self.atlas.active == ROOT_MAP
-        if pose_in_root_map is None or merged or root_map_pose is RootMapPose.REJECTED:
+        if pose_in_root_map is None or in_root_map or root_map_pose is RootMapPose.REJECTED:
             return result
         # the camera is in the root map, too: there its pose counts
         self._record_root_map_pose(pose_in_root_map)
@@ -639,7 +642,7 @@ class Backend:
 
     def _insert_keyframe(
         self, frame: FrameBundle, tracked: TrackedFrame, pose_in_root_map: InitialPose | None = None
-    ) -> tuple[dict[str, float], RootMapPose]:
+    ) -> tuple[dict[str, float], RootMapPose, bool]:
         """Make a tracked frame a keyframe, with bundle adjustment and loop closing.
 
         Args:
@@ -648,10 +651,12 @@ class Backend:
             pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
 
         Returns:
-            Seconds by stage, and whether the pose in the root map counts.
+            Seconds by stage, whether the pose in the root map counts, and whether a loop or a merge of maps
+            moved the frame.
         """
         slam_map = self.map
         root_map_pose = RootMapPose.REJECTED
+        moved_by_loop = False
 
         # local mapping: insert the keyframe, triangulate, cull, adjust its neighbourhood
         slot, timings = self.mapper.insert(
@@ -671,6 +676,7 @@ class Backend:
             T_before = slam_map.kf_pose[slot].copy()
             closing = self.loops.close(slot, tracked.observations, pose_in_root_map)
             root_map_pose = closing.root_map_pose
+            moved_by_loop = not np.array_equal(T_before, slam_map.kf_pose[slot])
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
@@ -683,7 +689,7 @@ class Backend:
         tracked.point = slam_map.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = slam_map.kf_pose[slot].copy()
         slam_map.release()
-        return timings, root_map_pose
+        return timings, root_map_pose, moved_by_loop
 
     def _transfer_history(self) -> None:
         """Poses relative to a culled keyframe become relative to its replacement."""

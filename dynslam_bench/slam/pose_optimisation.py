@@ -41,7 +41,11 @@ MEDIAN_CHI2 = 1.386
 LEAST_VARIANCE = 0.01
 """The residuals' variance is at least this share of the assumed one."""
 COVARIANCE_FACTOR = 1.57
-"""Calibrated factor on the covariance of a pose: residuals do not show all errors of the map that it is fitted to."""
+"""Calibrated factor on the covariance of a pose fitted to the map, which is given as that of the motion to it.
+
+It stands mostly for the error of the pose before: two independent fits would have the sum of both
+covariances, the earlier one transported by the motion's adjoint. The rest are errors of the map.
+"""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane are never inliers."""
 MIN_POINTS = 6
@@ -117,10 +121,12 @@ class PoseEstimate:
 
 
 def motion_covariance(estimate: PoseEstimate) -> Array | None:
-    """Covariance ``[6, 6]`` of the motion to a pose from the frame before it; None if it is not determined.
+    """Covariance ``[6, 6]`` of a pose's fit to the image, as that of the motion to it; None if it is not determined.
 
     It is the inverse of the pose's information, scaled by the variance of the residuals over the
-    assumed one, and by `COVARIANCE_FACTOR`. The frame before and the map count as known.
+    assumed one, and by `COVARIANCE_FACTOR`, which stands mostly for the error of the pose before.
+    The map counts as known. What the motion model, bundle adjustment or a loop make of the pose
+    afterwards is not in it.
     ``exp(xi) T_cam_world`` is ``T_world_cam exp(-xi)`` seen from the other side, so that the
     matrix is that of a right perturbation of ``T_prev_cur``, too.
     """

@@ -311,7 +311,7 @@ Level = Literal["red", "amber", "green"]
 def run_summary(
     row: RunRow, frames: RunFrames, least: LeastError | None = None
 ) -> tuple[Level, str]:
-    """Sentence on how a run ended, and why, with its level.
+    """Level of how a run ended, and a sentence on it and why.
 
     Red: it failed, or a camera that does not move has no larger error. Amber: frames were lost, the
     trajectory is probably faulty, or the error is more than `CATASTROPHE` times the least on the

@@ -309,7 +309,7 @@ def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
 
 
 def _provenance_cell(runs: Sequence[RunRow]) -> TableCell:
-    """Words on how closely a tracker follows its source, and whose masks it used."""
+    """Cell that says how closely a tracker follows its source, and whose masks it used."""
     provenance = runs[0].tracker.provenance
     networks = {row.segmentation for row in runs} - {"", "none"}
     masks = " + ".join(sorted({label_text(network) for network in networks}))
@@ -1179,7 +1179,7 @@ def repeatability(board: Board) -> Table | None:
 
 
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
-    """Words on how far the runs of a tracker lie apart; empty if it has no cell with several."""
+    """Cells that say how far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
     # cells whose seeds all gave one result, and cells with several different ones
     n_copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())

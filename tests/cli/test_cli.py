@@ -212,10 +212,8 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     """One store through its life."""
     code, out, _ = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
     shown = [re.split(r"\s{2,}", line) for line in out.splitlines()]
-    assert [(row[3], row[6], row[7]) for row in shown[1:3]] == [
-        ("ok", "0:3", "seed 0"),
-        ("ok", "0:3", "seed 1"),
-    ]
+    for row, seed in zip(shown[1:3], ("seed 0", "seed 1"), strict=True):
+        assert {"ok", "0:3", seed} <= set(row)
     remark = "warning: never-move on .* and 1 more run: little-truth: only 3 poses have ground truth: the alignment .*"
     assert re.fullmatch(remark, "".join(shown[3]))
     assert len(shown) == 4

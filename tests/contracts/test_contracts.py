@@ -121,8 +121,13 @@ def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
         (given(motion_covariance=np.eye(3)), "a motion covariance of shape (3, 3)"),
         (given(motion_covariance="sure"), "a motion covariance of shape ()"),
         (given(motion_covariance=np.full((6, 6), np.nan)), "a motion covariance of shape (6, 6)"),
-        (given(motion_covariance=np.zeros((6, 6))), "a motion covariance with the eigenvalue 0"),
+        (given(motion_covariance=np.zeros((6, 6))), "a motion covariance that is not pos"),
         (given(motion_covariance=np.triu(np.ones((6, 6)))), "a motion covariance that is not sym"),
+        (
+            given(motion_covariance=1e-9 * (np.eye(6) + np.triu(np.full((6, 6), 0.01), 1))),
+            "a motion covariance that is not sym",
+        ),
+        (given(motion_covariance=1e-9 * np.ones((6, 6))), "a motion covariance that is not pos"),
     ],
 )
 def test_blemishes_are_no_faults(result: TrackResult, words: str) -> None:
@@ -135,7 +140,10 @@ def test_a_covariance_is_taken_in_float64_and_none_costs_a_run() -> None:
     assert taken.motion_covariance is not None
     assert taken.motion_covariance.dtype == np.float64
     assert (taken.motion_covariance == np.eye(6)).all()
-    for wrong in (np.eye(3), "sure", [[1, 2], [3]], {"a": 1}):
+    row = check_result(given(motion_covariance=np.eye(6).ravel().tolist()), FRAME, "mine")
+    assert row.motion_covariance is not None
+    assert (row.motion_covariance == np.eye(6)).all()
+    for wrong in (np.eye(3), "sure", [[1, 2], [3]], {"a": 1}, np.ones((4, 9)), np.ones((1, 36))):
         taken = check_result(given(motion_covariance=wrong), FRAME, "mine")
         assert taken.motion_covariance is not None
         assert np.isnan(taken.motion_covariance).all()

@@ -8,6 +8,8 @@ import io
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from helpers.documented_names import PAGES, ROOT, sources
@@ -17,6 +19,7 @@ from dynslam_bench.core.settings import flatten
 from dynslam_bench.core.toml import parse_toml
 from dynslam_bench.gate import load_gate
 from dynslam_bench.sequences.cameras import read_camera
+from dynslam_bench.sequences.synthetic.sealed import parse_salt, sealed_scene
 from dynslam_bench.suites import load_suite
 from dynslam_bench.testing.template import write_tracker_template
 from dynslam_bench.trackers import TRACKERS
@@ -61,6 +64,8 @@ WITH_OUTPUT = {
 """Pages that show what commands print, and the file that their block of TOML is."""
 ELSEWHERE = {
     "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
+    "docs/how-to/gate.md": (1, "tests/docs/test_snippets.py"),
+    "docs/how-to/round.md": (1, "tests/docs/test_snippets.py"),
     "docs/how-to/filter.md": (2, "tests/trackers/adapters/test_adapter_controls.py"),
     "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
     "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_controls.py"),
@@ -157,6 +162,21 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
         "three trackers and a row, two sequences, two variants, three offsets"
     )
     assert {spec.tracker for spec in specs} == trackers
+
+
+def test_the_gate_s_fixture_on_the_page_is_used_as_it_says() -> None:
+    names: dict[str, Any] = {}
+    exec(compile(blocks("docs/how-to/gate.md")[0], "gate.md", "exec"), names)
+    names["test_gate"](SimpleNamespace(rounds=1))
+    with pytest.raises(AssertionError):
+        names["test_gate"](SimpleNamespace(rounds=0))
+
+
+def test_the_sealed_scene_is_derived_as_the_page_says() -> None:
+    names: dict[str, Any] = {"salt": "00" * 31 + "2a"}
+    exec(compile(blocks("docs/how-to/round.md")[0], "round.md", "exec"), names)
+    salt = parse_salt(names["salt"])
+    assert names["scene"] == sealed_scene(salt, "2026a", "walking_xyz", 17)
 
 
 def test_the_gate_on_the_page_is_one(tmp_path: Path) -> None:

@@ -12,15 +12,17 @@ from dynslam_bench.evaluation import evaluate
 from dynslam_bench.evaluation.uncertainty import (
     CHI2_95,
     CHI2_MEDIAN,
+    NO_NOISE,
     PoseNoise,
-    adjoint,
     motion_uncertainty,
     nees,
     truth_noise,
 )
-from dynslam_bench.geometry import Trajectory
+from dynslam_bench.geometry import RepeatedStamps, Trajectory
 from dynslam_bench.geometry.motion_covariances import (
     MotionCovariances,
+    adjoint,
+    check_covariances,
     read_motion_covariances,
     write_motion_covariances,
 )
@@ -148,7 +150,48 @@ def test_noise_of_the_truth_is_no_error_of_the_tracker():
     assert motion_uncertainty(*walk).metrics["nees_1f_mean"] > 3
     assert motion_uncertainty(*walk, noise).metrics["nees_1f_mean"] == pytest.approx(1, abs=0.1)
     assert truth_noise("tum/fr1/xyz").rotation_rad > 0
-    assert truth_noise("synthetic/walking_xyz?scene=3").translation_m == 0
+    assert truth_noise("synthetic/walking_xyz?scene=3") == NO_NOISE
+
+
+@pytest.mark.parametrize("sequence", ["euroc/MH_01_easy", "/home/me/walk", "tum"])
+def test_where_the_noise_of_the_truth_is_not_known_the_scores_say_so(sequence):
+    assert truth_noise(sequence) is None
+    walk = simulated(60)
+    scored = motion_uncertainty(*walk, None)
+    assert scored.metrics == motion_uncertainty(*walk, NO_NOISE).metrics
+    (warning,) = scored.warnings
+    assert "noise of the true poses is not known" in warning
+    assert not motion_uncertainty(*walk, NO_NOISE).warnings
+
+
+@pytest.mark.parametrize("repeated", [[5], [0, 7, 39], [20, 20]])
+def test_of_several_true_poses_at_one_stamp_the_last_counts(repeated):
+    estimate, covariances, truth = simulated(40)
+    expected = motion_uncertainty(estimate, covariances, truth).metrics
+    # wrong poses stand before the right ones of the same stamps
+    rows = np.sort(np.concatenate([np.arange(40), repeated])).astype(int)
+    poses = truth.T_world_cam[rows].copy()
+    poses[:-1][np.diff(rows) == 0] = exponential(np.full(6, 0.5))
+    several = RepeatedStamps(truth.timestamps[rows], poses)
+    assert motion_uncertainty(estimate, covariances, several).metrics == pytest.approx(expected)
+
+
+def test_covariances_belong_to_stamps_to_the_nanosecond():
+    estimate, covariances, truth = simulated(40)
+    scored = motion_uncertainty(estimate, covariances, truth)
+    assert "over 39 motions" in scored.diagnostics[0]
+    later = MotionCovariances(covariances.timestamps + 4e-7, covariances.matrices)
+    assert not motion_uncertainty(estimate, later, truth).metrics
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_covariances_are_checked_by_their_correlations(scale):
+    good = random_covariance(np.random.default_rng(5)) * scale
+    tilted = good + np.triu(1e-3 * np.sqrt(np.outer(np.diag(good), np.diag(good))), 1)
+    checks = check_covariances(np.stack([good, tilted, -good, np.full((6, 6), np.nan)]))
+    assert checks.symmetric.tolist()[:2] == [True, False]
+    assert checks.positive.tolist() == [True, True, False, False]
+    assert checks.finite.tolist() == [True, True, True, False]
 
 
 def test_a_walk_that_is_interrupted_is_scored_where_covariances_are():

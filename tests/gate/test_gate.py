@@ -225,8 +225,13 @@ def test_frame_times_are_paired(times, spread, state) -> None:
     found = judge(baseline, candidate, guarded(frame_time=1.2), 4)
     assert found.guardrails[-1].state == state
     assert found.exit_code == {"broken": 4, "held": 0, "open": 5}[state]
+    assert [rail.state for rail in found.overruling] == [state] * (state != "held")
     untimed = judge(baseline, candidate, guarded(frame_time=1.2), 4, timed=False)
     assert untimed.guardrails[-1].state == "not measured"
+    # what the exit code leaves out does not overrule the verdict, either
+    single = judge(baseline, candidate, guarded(frame_time=1.2), 1, timed=False)
+    assert single.exit_code == 5
+    assert not single.overruling
 
 
 def test_a_floor_names_the_sequence() -> None:
@@ -655,6 +660,29 @@ def test_copies_of_one_run_show_no_scatter(tmp_path, sequences) -> None:
     assert result.verdict is GateVerdict.UNDECIDED
     assert result.exit_code == 5
     assert any("equal to the last bit on one, two" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("first_is_equal", [False, True])
+def test_copies_on_one_sequence_of_two_count_as_one_run(
+    tmp_path, sequences, first_is_equal
+) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    results = tmp_path / "results"
+    before = write_trajectories(tmp_path / "before", sequences, 0.01, runs=3, seed=1)
+    after = write_trajectories(tmp_path / "after", sequences, 0.05, runs=3, seed=2)
+    copied = after / file_name(sequences[0].name)
+    for number in (1, 2):
+        (copied / f"{number}.txt").write_text((copied / "0.txt").read_text())
+    if first_is_equal:
+        for sequence in sequences:
+            own = file_name(sequence.name)
+            (before / own / "0.txt").write_text((after / own / "0.txt").read_text())
+    gates.record(question, trajectories=before, results=results)
+    result = gates.check(question, trajectories=after, results=results)
+    assert result.verdict is GateVerdict.UNDECIDED
+    assert result.rounds == 1
+    assert result.low is None
+    assert any("candidate are equal to the last bit on one:" in note for note in result.notes)
 
 
 def test_errors_on_other_data_are_not_compared(tmp_path) -> None:

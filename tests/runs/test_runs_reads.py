@@ -34,8 +34,10 @@ class Child:
             f"import {preloaded}; exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
         )
         pipe = subprocess.PIPE
-        places = os.pathsep.join([*path, os.environ.get("PYTHONPATH", "")])
-        environment = os.environ | {"PYTHONPATH": places}
+        environment = dict(os.environ)
+        if path:  # else the recording process has the same variables as this one
+            places = [*path, *filter(None, [environment.get("PYTHONPATH")])]
+            environment["PYTHONPATH"] = os.pathsep.join(places)
         self.process = subprocess.Popen(
             [sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True, env=environment
         )

@@ -288,10 +288,41 @@ class OwnNames(FixedSegmenter):
         return Instances(masks, boxes_of(masks), ("Pedestrian",), np.ones(1, np.float32))
 
 
+class RemembersFrames(FixedSegmenter):
+    seen = 0
+
+    def reset(self):
+        self.seen = 0
+
+    def segment(self, frame):
+        self.seen += 1
+        return super().segment(frame)
+
+
+REMEMBERS = SegmenterSpec("remembers", f"{__name__}:RemembersFrames")
 OWN = SegmenterSpec("own", f"{__name__}:OwnNames")
 FIXED = SegmenterSpec("fixed", f"{__name__}:FixedSegmenter")
 SMALL = SegmenterSpec("small", f"{__name__}:SmallMasks")
 BROKEN = SegmenterSpec("broken", "operator:eq")
+
+
+@pytest.mark.parametrize(("spec", "is_cached"), [("FIXED", True), ("REMEMBERS", False)])
+def test_masks_of_a_segmenter_that_remembers_frames_are_not_stored(
+    tmp_path, monkeypatch, spec, is_cached
+):
+    monkeypatch.setattr(
+        "dynslam_bench.segmentation.build_segmenter.stage_code", lambda _: lambda: "known"
+    )
+    sys.modules.setdefault(__name__, sys.modules[__name__])
+    settings = SegmentationSettings(source=f"plugin:{__file__}:{spec}")
+    built = build_segmenter(settings, cache=StageCache(tmp_path))
+    assert isinstance(built.inner, CachedSegmenter) == is_cached
+    for _ in range(2):
+        built.reset()
+        for _ in range(3):
+            built.segment(frame())
+    if not is_cached:
+        assert built.inner.seen == 3
 
 
 @pytest.mark.slow

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.point_world import make_backend, track_all
 
 from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.slam.loop_closing import LoopClosingResult
 from dynslam_bench.slam.pose_optimisation import (
     CAUCHY,
     COVARIANCE_FACTOR,
@@ -66,3 +68,22 @@ def test_the_covariance_is_that_of_simulated_poses(noise_px):
     assert np.diag(np.cov(whitened.T)) == pytest.approx(np.full(6, expected), rel=0.25)
     # and the errors in different directions are independent
     assert np.abs(np.corrcoef(whitened.T) - np.eye(6)).max() < 0.2
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 0.02, 0.5])
+def test_a_frame_that_a_loop_moved_has_no_covariance(room, monkeypatch, moved_m):
+    """The covariance is that of the fit to the image, which knows nothing of the loop."""
+    backend = make_backend(room, loop_closing__enabled=True, keyframes__schedule="every")
+    frames = [room.see(pose, index) for index, pose in enumerate(room.path(4))]
+    before = track_all(backend, frames[:3])
+    assert before[0].motion_covariance is None, "the first frame has no motion"
+    assert all(np.linalg.eigvalsh(result.motion_covariance)[0] > 0 for result in before[1:])
+
+    def close(slot, *_):
+        backend.map.kf_pose[slot, 0, 3] += moved_m
+        return LoopClosingResult()
+
+    monkeypatch.setattr(backend.loops, "close", close)
+    (result,) = track_all(backend, frames[3:])
+    assert result.keyframe
+    assert (result.motion_covariance is None) == (moved_m > 0)

@@ -423,7 +423,7 @@ def _facts_of_bank(folder: Path) -> DatasetFacts:
         files=tuple(contents),
         limitations="Errors hold for these sequences, settings and machines. A row that nobody has run again is its "
         "owner's word; an imported one names where it comes from.",
-        biases="Systems and sequences are those that somebody has added; they are no sample of the field.",
+        biases="Systems and sequences are those that people have added; they are no sample of the field.",
         personal="None in the bank: it holds poses and no images. Recordings that it refers to may show persons.",
         uses="To compare SLAM systems, to score their trajectories under other protocols, and to check published rows.",
         impact="Rows that others can run again make results easier to trust. A rank can be taken for fitness "

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import Camera, load_tum, se3
-from dynslam_bench.geometry.motion_covariances import read_motion_covariances
+from dynslam_bench.geometry.motion_covariances import (
+    at_poses,
+    between_poses,
+    compose_covariances,
+    read_motion_covariances,
+)
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
 MAX_CORNERS = 400
@@ -155,27 +160,33 @@ class Replay:
     """A trajectory file as a tracker: each frame gets the pose with the nearest stamp.
 
     A frame without a pose within the tolerance is lost; poses are not interpolated and keep the
-    file's world frame.
+    file's world frame. The covariance of a motion over several poses of the file is composed of
+    theirs.
 
     Args:
         settings: The file and the tolerance.
 
     Raises:
-        TrajectoryError: The file is missing, damaged, or holds no pose.
+        TrajectoryError: The file is missing, damaged, or holds no pose; or the covariances are those of
+            another trajectory.
     """
 
     def __init__(self, settings: ReplaySettings) -> None:
         self.settings = settings
         file = load_tum(Path(settings.file).expanduser())
         self._trajectory = file.trajectory
-        self._covariances = None
+        self._covariances: NDArray[np.float64] | None = None
+        self._last_row: int | None = None
         if settings.covariances:
-            self._covariances = read_motion_covariances(settings.covariances)
+            given = read_motion_covariances(settings.covariances)
+            given = at_poses(given, self._trajectory, settings.covariances)
+            self._covariances = between_poses(self._trajectory, given)
         self.measured = {"notes": file.notes.describe()}
         """``notes``: what of the file was not taken as it stands."""
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; the poses depend on the frames' stamps only."""
+        self._last_row = None
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of the frame's stamp, ``ok``; or ``lost`` without a pose. Stats: ``stamp_gap_s`` to the nearest."""
@@ -186,18 +197,20 @@ class Replay:
         # the small term is the rounding of the difference
         if gap > self.settings.tolerance_s + 1e-9:
             return TrackResult(T_world_cam=None, state="lost", stats=stats)
+        covariance = self._covariance_to(nearest)
+        self._last_row = nearest
         return TrackResult(
             T_world_cam=self._trajectory.T_world_cam[nearest].copy(),
             state="ok",
             stats=stats,
-            motion_covariance=self._covariance_at(float(stamps[nearest])),
+            motion_covariance=covariance,
         )
 
-    def _covariance_at(self, stamp: float) -> NDArray[np.float64] | None:
-        """The covariance of the motion to the pose of a stamp; None where the file has none."""
-        if self._covariances is None:
+    def _covariance_to(self, row: int) -> NDArray[np.float64] | None:
+        """The covariance of the motion from the last pose that was given to a row's; None where it is not known."""
+        if self._covariances is None or self._last_row is None or row <= self._last_row:
             return None
-        gaps = np.abs(self._covariances.timestamps - stamp)
-        nearest = int(np.argmin(gaps))
-        # files hold stamps to the microsecond at least
-        return self._covariances.matrices[nearest].copy() if gaps[nearest] < 1e-6 else None
+        # a trajectory may be denser than the frames, and frames between may have been lost
+        pairs = np.array([[self._last_row, row]], dtype=np.intp)
+        matrix = compose_covariances(self._trajectory.T_world_cam, self._covariances, pairs)[0]
+        return None if np.isnan(matrix).all() else matrix

@@ -53,17 +53,17 @@ class ReplaySettings(Settings):
     )
 
     def verify(self) -> None:
-        """There must be a file, and a trajectory in it; and covariances in theirs."""
+        """There must be a file, and a trajectory in it; and covariances of its poses in theirs."""
         from dynslam_bench.geometry import read_tum
-        from dynslam_bench.geometry.motion_covariances import read_motion_covariances
+        from dynslam_bench.geometry.motion_covariances import at_poses, read_motion_covariances
 
         if not self.file.strip():
             raise SettingsError(
                 "replay needs a trajectory file", "write replay:FILE or --set file=FILE"
             )
-        read_tum(Path(self.file).expanduser())
+        trajectory = read_tum(Path(self.file).expanduser())
         if self.covariances:
-            read_motion_covariances(self.covariances)
+            at_poses(read_motion_covariances(self.covariances), trajectory, self.covariances)
 
 
 class SubprocessSettings(ProgramSettings):

@@ -27,6 +27,7 @@ from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
 from dynslam_bench.geometry.motion_covariances import (
     MotionCovariances,
+    adjoint,
     write_motion_covariances,
 )
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
@@ -144,6 +145,48 @@ def test_replay_gives_the_covariances_of_a_file(trajectory, tmp_path):
     file.write_text("1 2\n")
     with pytest.raises(TrajectoryError, match="has 2 values, not the 37"):
         build_tracker(f"replay:{path}", settings)
+
+
+@pytest.mark.parametrize("per_s", [1e3, 1e6, 1e9])
+def test_replay_takes_covariances_in_the_units_of_trajectories(trajectory, tmp_path, per_s):
+    path, stamps, _ = trajectory
+    file = tmp_path / "covariances.txt"
+    numbers = " ".join("1" if k % 7 == 0 else "0" for k in range(36))
+    file.write_text("".join(f"{stamp * per_s:.6f} {numbers}\n" for stamp in stamps[1:].tolist()))
+    tracker = reset(build_tracker(f"replay:{path}", {"covariances": str(file)}))
+    results = [tracker.track(blank(k, float(stamp))) for k, stamp in enumerate(stamps)]
+    assert all(np.array_equal(result.motion_covariance, np.eye(6)) for result in results[1:])
+
+
+@pytest.mark.parametrize(("later", "belong"), [(0.01, 0), (11 / 30, 8)])
+def test_replay_refuses_covariances_of_another_trajectory(trajectory, tmp_path, later, belong):
+    path, stamps, _ = trajectory
+    file = tmp_path / "covariances.txt"
+    matrices = np.tile(np.eye(6), (19, 1, 1))
+    write_motion_covariances(file, MotionCovariances(stamps[1:] + later, matrices))
+    with pytest.raises(TrajectoryError, match=f"{belong} of 19 stamps .* belong to a pose"):
+        build_tracker(f"replay:{path}", {"covariances": str(file)})
+
+
+@pytest.mark.parametrize("seen", [[0, 2, 4], [3, 4, 9], [0, 1, 1, 2]])
+def test_replay_composes_the_covariances_of_poses_between_frames(trajectory, tmp_path, seen):
+    path, stamps, poses = trajectory
+    file = tmp_path / "covariances.txt"
+    matrices = np.array([np.eye(6) * (k + 1) for k in range(19)])
+    write_motion_covariances(file, MotionCovariances(stamps[1:], matrices))
+    tracker = reset(build_tracker(f"replay:{path}", {"covariances": str(file)}))
+    results = [tracker.track(blank(k, float(stamps[row]))) for k, row in enumerate(seen)]
+    assert results[0].motion_covariance is None
+    for k in range(1, len(seen)):
+        # each error, transported behind the rest of the motion
+        expected = np.zeros((6, 6))
+        for row in range(seen[k - 1] + 1, seen[k] + 1):
+            back = adjoint(se3.inverse(poses[seen[k]]) @ poses[row])
+            expected += back @ matrices[row - 1] @ back.T
+        if seen[k] == seen[k - 1]:
+            assert results[k].motion_covariance is None
+        else:
+            assert np.allclose(results[k].motion_covariance, expected, rtol=1e-6)
 
 
 def test_replay_id_carries_the_file(trajectory):
