@@ -109,12 +109,11 @@ def at_poses(
             "give the covariances of this trajectory, with the stamps of its poses",
         )
 
-    # the nearest pose's own stamp
-    after = np.clip(np.searchsorted(poses, stamps), 1, max(len(poses) - 1, 1))
-    rows = np.stack([after - 1, np.minimum(after, len(poses) - 1)])
-    nearest = np.take_along_axis(rows, np.abs(poses[rows] - stamps).argmin(axis=0)[None], axis=0)[0]
-    found = np.abs(poses[nearest] - stamps) < tolerance_s
-    return MotionCovariances(poses[nearest[found]], covariances.matrices[found])
+    # the nearest pose's own stamp: between two poses rows grow in proportion to time
+    rows = np.interp(stamps, poses, np.arange(len(poses)))
+    nearest = np.rint(rows).astype(np.intp)
+    belongs = np.abs(poses[nearest] - stamps) < tolerance_s
+    return MotionCovariances(poses[nearest[belongs]], covariances.matrices[belongs])
 
 
 def between_poses(trajectory: Trajectory, covariances: MotionCovariances) -> Array:
