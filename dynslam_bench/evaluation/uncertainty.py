@@ -142,19 +142,18 @@ def motion_uncertainty(
     one_second = _Motions.of(estimate.T_world_cam, poses, seconds, composed, known_noise)
 
     metrics = one_frame.metrics("1f") | one_second.metrics("1s")
-    source = (
-        f"the truth's own noise, {1e3 * known_noise.translation_m:.2g} mm and "
-        f"{np.rad2deg(known_noise.rotation_rad):.2g} deg"
-        if known_noise != NO_NOISE
-        else "no noise of the truth"
-    )
+    if noise is None:
+        source = "the errors of the truth, whose noise is not known"
+    elif noise == NO_NOISE:
+        source = "no noise of the truth"
+    else:
+        source = (
+            f"the truth's own noise, {1e3 * noise.translation_m:.2g} mm and "
+            f"{np.rad2deg(noise.rotation_rad):.2g} deg"
+        )
     diagnostics = [
         f"NEES over {len(pairs)} motions from frame to frame and {len(seconds)} over one second, with {source}"
     ]
-    if noise is None:
-        warnings.append(
-            "the noise of the true poses is not known: the NEES of the covariances includes the truth's errors"
-        )
     return Uncertainty(metrics, diagnostics, warnings + one_frame.doubts())
 
 

@@ -159,9 +159,9 @@ def test_where_the_noise_of_the_truth_is_not_known_the_scores_say_so(sequence):
     walk = simulated(60)
     scored = motion_uncertainty(*walk, None)
     assert scored.metrics == motion_uncertainty(*walk, NO_NOISE).metrics
-    (warning,) = scored.warnings
-    assert "noise of the true poses is not known" in warning
-    assert not motion_uncertainty(*walk, NO_NOISE).warnings
+    assert scored.warnings == motion_uncertainty(*walk, NO_NOISE).warnings == []
+    (line,) = scored.diagnostics
+    assert "the errors of the truth, whose noise is not known" in line
 
 
 @pytest.mark.parametrize("repeated", [[5], [0, 7, 39], [20, 20]])

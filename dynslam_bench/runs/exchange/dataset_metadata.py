@@ -27,7 +27,7 @@ from dynslam_bench.sequences.synthetic import render_synthetic
 CROISSANT_FILE = "croissant.json"
 CARD_FILE = "DATA_CARD.md"
 _MADE = "<!-- made by: dynslam-bench describe -->"
-"""The first line of the card; a card without it, and the metadata beside it, are somebody's own, and stay."""
+"""The first line of the card; a card without it, and the metadata beside it, were written by a person, and stay."""
 CROISSANT = "http://mlcommons.org/croissant/1.0"
 CROISSANT_RAI = "http://mlcommons.org/croissant/RAI/1.0"
 _CONTEXT: dict[str, Any] = {
